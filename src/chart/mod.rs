@@ -169,8 +169,9 @@ pub fn chart(
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
     let threads = pool.current_num_threads();
     let ends = began + Duration::from_secs_f64(options.seconds);
-    let mut charting = Charting { settings, device, pool, ends, stop, tell, not_measured: Vec::new() };
     let slides = FirstSlides::read(settings, if options.pictures { picture::SLIDES } else { 1 }, stop)?;
+    let settings = &slides.settled(settings);
+    let mut charting = Charting { settings, device, pool, ends, stop, tell, not_measured: Vec::new() };
     let opened = ftle::Opened::new(settings, device, &slides)?;
     let (source, tau, time_unit) = (opened.plan.source.clone(), opened.plan.map.tau, opened.plan.time_unit.clone());
     let ftle = if options.ftle {

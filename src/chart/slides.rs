@@ -3,7 +3,7 @@
 use super::picture::with_method;
 use crate::flow::VelocitySource;
 use crate::render::Method;
-use crate::run::{RunError, Settings, Setup, Slide, Slides};
+use crate::run::{RunError, Settings, Setup, Slide, Slides, TimeSpan};
 use crate::surrogate::Kind;
 use ridgewatch_base::memory;
 use std::collections::VecDeque;
@@ -14,6 +14,8 @@ pub(super) struct FirstSlides {
     slides: Vec<Slide>,
     /// Why there are no more.
     end: String,
+    /// |tau|, in time units of the source.
+    tau: f64,
 }
 
 impl FirstSlides {
@@ -50,7 +52,14 @@ impl FirstSlides {
                 }
             }
         }
-        Ok(Self { slides, end })
+        Ok(Self { slides, end, tau: setup.plan.map.tau })
+    }
+
+    /// The settings with the tau of these slides, so that it is not chosen again.
+    pub(super) fn settled(&self, settings: &Settings) -> Settings {
+        let mut settings = settings.clone();
+        settings.time.tau = Some(TimeSpan::Number(self.tau));
+        settings
     }
 
     /// Why there are fewer slides than were asked for.

@@ -59,7 +59,7 @@ pub(super) fn race(
     slides: &FirstSlides,
 ) -> Result<Choice, RunError> {
     const METHODS: [Method; 3] = [Method::TwoLevel, Method::Marched, Method::Reference];
-    let mut settings = settings.clone();
+    let mut settings = slides.settled(settings);
     settings.transfer = Some(colours_of(&settings, device, slides)?);
     let options = RunOptions { device: device.clone(), threads, ..RunOptions::default() };
     // Small frames, so that a method ends soon after the target.

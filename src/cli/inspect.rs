@@ -15,7 +15,7 @@ pub struct Options {
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Integration time for which the memory of the window is stated, in seconds or with a unit, e.g. "30 days"; default: the scene's
-    /// `time.tau`, else half of the span.
+    /// `time.tau`, else the longest default, half of the span.
     #[arg(long)]
     tau: Option<String>,
 }

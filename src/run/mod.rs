@@ -6,6 +6,7 @@
 mod assess;
 mod checkpoints;
 mod cycle;
+mod default_tau;
 mod error;
 mod frame;
 mod memory;

@@ -1,7 +1,8 @@
 //! Setup of a run from its settings: opens the source, chooses open settings, and checks everything before work starts.
 
+use super::default_tau::default_tau;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
-use super::{RunError, Settings, TimeSettings, memory};
+use super::{RunError, Settings, TimeSettings, TimeSpan, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
@@ -103,11 +104,8 @@ impl Setup {
             (None, Some(_)) if archive && scene.archive.steady => {
                 return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
             }
-            (None, Some(source)) => {
-                let tau = source.default_tau()?;
-                notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
-                tau
-            }
+            // Found below, with the settings of the flow map.
+            (None, Some(_)) => 0.0,
             (None, None) if scene.source.kind == SourceKind::Live => {
                 return Err(Refused::new("time.tau", "is missing", "a duration in the simulation's time (attach --tau TIME)").into());
             }
@@ -134,7 +132,7 @@ impl Setup {
             _ => Boundary::Unbounded,
         });
         let interpolation = scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear });
-        let map = FlowMap {
+        let mut map = FlowMap {
             tau,
             direction,
             integrator: scene.flow.integrator,
@@ -151,6 +149,16 @@ impl Setup {
             normalisation: scene.flow.normalisation,
             interpolation,
         };
+        if let (None, Some(source), Some(grid)) = (&scene.time.tau, &mut snapshots, &grid) {
+            let (times, nodes) = (source.times().to_vec(), grid.nodes());
+            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes)).is_ok();
+            let (tau, why) = default_tau(&mut **source, &map, scene.seed, fits)?;
+            let unit = source.describe().time_unit;
+            let words = if unit == "s" { in_words(tau) } else { String::new() };
+            notes.push(format!("time.tau is not given: {tau} {unit}{words}, {why}"));
+            (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
+        }
+        let tau = map.tau;
         let domain = match (&closed, &scene.domain, &grid) {
             (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
             (_, _, Some(grid)) => grid.domain(),
@@ -185,6 +193,17 @@ impl Setup {
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
         Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, slides, notes })
+    }
+}
+
+/// Seconds in hours or days, if they are many.
+fn in_words(seconds: f64) -> String {
+    const HOUR: f64 = 3600.0;
+    const DAY: f64 = 24.0 * HOUR;
+    match seconds {
+        _ if seconds < 2.0 * HOUR => String::new(),
+        _ if seconds < 2.0 * DAY => format!(" ({:.1} hours)", seconds / HOUR),
+        _ => format!(" ({:.1} days)", seconds / DAY),
     }
 }
 

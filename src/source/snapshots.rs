@@ -41,18 +41,13 @@ pub trait SnapshotSource: Send {
         self.describe().kind
     }
 
-    /// Default |tau|: half the span of the archive, at least two intervals.
+    /// Longest |tau| that is taken by default: half the span of the archive, at least two intervals, or the span if that is shorter.
     ///
     /// # Errors
-    /// Fewer than three snapshots.
-    fn default_tau(&self) -> Result<f64, SourceError> {
+    /// Only one time.
+    fn longest_default_tau(&self) -> Result<f64, SourceError> {
         let (span, interval) = self.span_and_interval()?;
-        let tau = (span / 2.0).max(2.0 * interval);
-        if self.times().len() < 3 {
-            return Err(SourceError::TooShort { source_name: self.name(), tau, needed: 3, found: self.times().len(), interval, span });
-        }
-        // With uneven steps, two median intervals may be longer than the archive.
-        Ok(tau.min(span))
+        Ok((span / 2.0).max(2.0 * interval).min(span))
     }
 
     /// A time as a date or, without a calendar, as a number.

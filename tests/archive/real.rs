@@ -77,7 +77,7 @@ fn globcurrent() {
     assert_eq!((grid.axes[0].first(), grid.axes[1].first(), grid.axes[0].period()), (14.875, -40.125, None));
     assert_eq!(archive.date(archive.times()[0]).as_deref(), Some("2002-01-01T00:00:00Z"));
     assert_eq!(archive.date(archive.times()[59]).as_deref(), Some("2002-03-01T00:00:00Z"));
-    assert_eq!((archive.default_tau().unwrap(), archive.gaps().len()), (29.5 * 86_400.0, 0));
+    assert_eq!((archive.longest_default_tau().unwrap(), archive.gaps().len()), (29.5 * 86_400.0, 0));
     let snapshot = archive.read(0).unwrap();
     // Counted with another tool: 769 of 3321 values are NaN.
     assert_eq!(snapshot.missing_nodes(), 769);

@@ -221,7 +221,7 @@ fn tau_against_the_archive() {
     let file = plane(CLASSIC, &times, DAYS).write(&dir.path().join("long.nc"));
     let archive = open(&[file]);
     let day = 86_400.0;
-    assert_eq!(archive.default_tau().unwrap(), 5.0 * day);
+    assert_eq!(archive.longest_default_tau().unwrap(), 5.0 * day);
     assert!(archive.check_tau(10.0 * day).is_ok());
     assert!(matches!(archive.check_tau(10.5 * day), Err(SourceError::TooShort { needed: 12, found: 11, .. })));
     let message = archive.check_tau(30.0 * day).unwrap_err().to_string();
@@ -229,10 +229,10 @@ fn tau_against_the_archive() {
     assert!(archive.check_tau(0.0).is_err() && archive.check_tau(f64::NAN).is_err());
     let short = plane(CLASSIC, &[0.0, 1.0], DAYS).write(&dir.path().join("short.nc"));
     let archive = open(&[short]);
-    assert!(matches!(archive.default_tau(), Err(SourceError::TooShort { needed: 3, found: 2, .. })));
+    assert_eq!(archive.longest_default_tau().unwrap(), day);
     let one = plane(CLASSIC, &[1.0], DAYS).write(&dir.path().join("one.nc"));
     let archive = open(&[one]);
-    for message in [archive.default_tau().unwrap_err().to_string(), archive.check_tau(day).unwrap_err().to_string()] {
+    for message in [archive.longest_default_tau().unwrap_err().to_string(), archive.check_tau(day).unwrap_err().to_string()] {
         for piece in ["one.nc holds one time (", "-02T00:00:00Z)", "--set archive.steady=true", "--set time.tau=DURATION"] {
             assert!(message.contains(piece), "{message}");
         }

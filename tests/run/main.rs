@@ -4,6 +4,7 @@
 mod archives;
 mod checkpoints;
 mod command_line;
+mod default_tau;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod messages;

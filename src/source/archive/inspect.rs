@@ -300,7 +300,7 @@ fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: 
         Some(tau) if steady => Ok(tau),
         Some(tau) => archive.check_tau(tau).map(|()| tau),
         None if steady => Err(SourceError::setting("tau", "missing", "a duration, since a steady flow has no default")),
-        None => archive.default_tau(),
+        None => archive.longest_default_tau(),
     };
     // A steady flow counts twice (see [`super::steady::Steady`]).
     let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { window_snapshots(times, t) });
