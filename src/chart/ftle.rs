@@ -105,7 +105,7 @@ impl Opened {
         /// Intervals of a composed flow map of a closed form.
         const CLOSED: usize = 10;
         // The method of the scene plays no part.
-        let plan = Setup::new(with_method(settings, Method::TwoLevel, settings.surrogate.kind))?.plan;
+        let plan = Setup::new(with_method(&slides.settled(settings), Method::TwoLevel, settings.surrogate.kind))?.plan;
         let slide = slides.first().clone();
         let (intervals, window_bytes) = match &slide.velocity {
             VelocitySource::Analytic(..) => (CLOSED, 0),

@@ -230,7 +230,7 @@ pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSet
 
 /// As [`fixed_colours`], with slides that were read before.
 pub(super) fn colours_of(settings: &Settings, device: &Device, slides: &FirstSlides) -> Result<TransferSettings, RunError> {
-    let plan = Setup::new(with_method(settings, Method::Reference, Kind::Table))?.plan;
+    let plan = Setup::new(with_method(&slides.settled(settings), Method::Reference, Kind::Table))?.plan;
     fn of<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide) -> Result<TransferSettings, RunError> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         settled_colours(plan, &tracer, slide)

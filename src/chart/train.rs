@@ -86,7 +86,7 @@ pub fn train(
     let slides = FirstSlides::read(settings, 1, stop)?;
     let opened = Opened::new(settings, device, &slides)?;
     let colours = colours_of(settings, device, &slides)?;
-    let settings = Settings { transfer: Some(colours), ..settings.clone() };
+    let settings = Settings { transfer: Some(colours), ..slides.settled(settings) };
     let training = Training { settings: &settings, options, opened: &opened, stop };
     pool.install(|| match device {
         Device::Cpu { .. } => training.on(Cpu, epoch),

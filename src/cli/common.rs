@@ -179,8 +179,11 @@ pub fn ring_folder(option: Option<&Path>) -> Result<PathBuf> {
 }
 
 /// Describes a number of steps that was chosen by its error.
-pub fn chosen_steps(steps: u64, difference: f64) -> String {
-    format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of more steps")
+pub fn chosen_steps(steps: u64, difference: f64, residual: Option<f64>) -> String {
+    match residual {
+        Some(residual) => format!("{steps} steps a path: colours differ by {residual:.3} of their range, rms, from those of many more"),
+        None => format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many"),
+    }
 }
 
 /// Refuses a checkpoint option if nothing is trained.

@@ -377,7 +377,7 @@ fn print_report(report: &Report) {
         report.samples_per_second
     ));
     if let Some(difference) = report.integration_difference {
-        messages::note(chosen_steps(report.steps as u64, difference));
+        messages::note(chosen_steps(report.steps as u64, difference, None));
     }
     print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
     if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {

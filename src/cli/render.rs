@@ -110,7 +110,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         messages::note(warning);
     }
     if let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference) {
-        messages::note(chosen_steps(steps, difference));
+        messages::note(chosen_steps(steps, difference, frame.record.integration_residual));
     }
     print_text(format_args!("{}: {}", options.out.display(), session::line(&frame.record)));
     Ok(())

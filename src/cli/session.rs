@@ -252,7 +252,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
             if last.is_none()
                 && let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference)
             {
-                bar.suspend(|| messages::note(chosen_steps(steps, difference)));
+                bar.suspend(|| messages::note(chosen_steps(steps, difference, frame.record.integration_residual)));
             }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
             notify::running(|| format!("frame {}: {}", frame.record.frame, line(&frame.record)));

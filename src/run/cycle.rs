@@ -278,6 +278,8 @@ fn drive<B: Backend>(
     let mut beginning = Beginning { threads: &threads, stop, warnings: Vec::new() };
     let mut session = begin(backend, &plan, &slide, &mut beginning)?;
     check_stop(stop)?;
+    // A flow map that is made again, after a failure, has its steps given.
+    let chosen = with!(&session, on => on.tracer().flow().step_choice());
     let map = match with!(&session, on => fixed_steps(on.tracer().flow())) {
         Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
         None => plan.map.clone(),
@@ -297,7 +299,9 @@ fn drive<B: Backend>(
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
     let mut cycle = Cycle { run, session, map };
-    cycle.settle_steps(&mut slide)?;
+    cycle.run.report.integration_difference = chosen.map(|c| c.difference).filter(|difference| difference.is_finite());
+    slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen));
+    cycle.settle_steps(&slide, chosen)?;
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
     // The checkpoint is written even if the run was stopped.
     match ended {
@@ -381,7 +385,6 @@ impl<'a> Run<'a> {
         }
         report.transfer = Some(transfer);
         report.integration_steps = fixed_steps(flow);
-        report.integration_difference = flow.step_choice().map(|c| c.difference).filter(|difference| difference.is_finite());
         let learning = Learning {
             trust: TrustMap::new(&scene.trust, &plan.domain),
             buffer,
@@ -402,9 +405,7 @@ impl<'a> Run<'a> {
 
 impl<B: Backend> Cycle<'_, B> {
     /// Replaces the flow map of the first slide by one with the steps of the picture.
-    fn settle_steps(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
-        let chosen = with!(&self.session, on => on.tracer().flow().step_choice());
-        slide.warnings.extend(with!(&self.session, on => self.run.flow_warnings(on.tracer().flow())));
+    fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
         let Run { plan, threads, renderer, .. } = &self.run;
         let Some(settled) = threads.render().install(|| picture_steps(plan, slide, renderer.transfer(), chosen))? else { return Ok(()) };
         tracing::info!("{settled:?} instead of {chosen:?}");
@@ -573,16 +574,16 @@ impl Run<'_> {
     }
 
     /// Warnings about the flow map of the first slide.
-    fn flow_warnings(&self, flow: &dyn Tracer) -> Vec<String> {
+    fn flow_warnings(&self, flow: &dyn Tracer, chosen: Option<StepChoice>) -> Vec<String> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
-        if let Some(chosen) = flow.step_choice().filter(|chosen| chosen.not_finite > 0) {
+        if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(
                 "{} of {} paths of the step choice have no finite log-stretch: the integration overflowed there",
                 chosen.not_finite,
                 StepChoice::POINTS
             ));
         }
-        if let Some(chosen) = flow.step_choice().filter(|chosen| !chosen.within_tolerance) {
+        if let Some(chosen) = chosen.filter(|chosen| !chosen.within_tolerance) {
             warnings.push(format!(
                 "{} steps a path, the maximum, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
                 chosen.steps, chosen.difference

@@ -123,7 +123,7 @@ impl TimeSpan {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TimeSettings {
-    /// |tau|; `None`: chosen from the stretching of an archive's flow, at most half of its span. Required by other sources.
+    /// |tau|; `None`: chosen from the stretching of an archive's flow, at most half of its span or two intervals. Required by other sources.
     pub tau: Option<TimeSpan>,
     /// Direction; `None`: backward for archives and live runs, forward otherwise.
     pub direction: Option<Direction>,

@@ -104,8 +104,8 @@ impl Setup {
             (None, Some(_)) if archive && scene.archive.steady => {
                 return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
             }
-            // Found below, with the settings of the flow map.
-            (None, Some(_)) => 0.0,
+            // Chosen below, at most this.
+            (None, Some(source)) => source.longest_default_tau()?,
             (None, None) if scene.source.kind == SourceKind::Live => {
                 return Err(Refused::new("time.tau", "is missing", "a duration in the simulation's time (attach --tau TIME)").into());
             }
@@ -149,16 +149,6 @@ impl Setup {
             normalisation: scene.flow.normalisation,
             interpolation,
         };
-        if let (None, Some(source), Some(grid)) = (&scene.time.tau, &mut snapshots, &grid) {
-            let (times, nodes) = (source.times().to_vec(), grid.nodes());
-            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes)).is_ok();
-            let (tau, why) = default_tau(&mut **source, &map, scene.seed, fits)?;
-            let unit = source.describe().time_unit;
-            let words = if unit == "s" { in_words(tau) } else { String::new() };
-            notes.push(format!("time.tau is not given: {tau} {unit}{words}, {why}"));
-            (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
-        }
-        let tau = map.tau;
         let domain = match (&closed, &scene.domain, &grid) {
             (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
             (_, _, Some(grid)) => grid.domain(),
@@ -173,6 +163,17 @@ impl Setup {
             None => refused,
         })?;
         scene.surrogate.check_nodes(domain.dimensions)?;
+        // After the checks that read nothing.
+        if let (None, Some(source), Some(grid)) = (&scene.time.tau, &mut snapshots, &grid) {
+            let (times, nodes) = (source.times().to_vec(), grid.nodes());
+            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes)).is_ok();
+            let (tau, why) = default_tau(&mut **source, &map, fits)?;
+            let unit = source.describe().time_unit;
+            let words = if unit == "s" { in_words(tau) } else { String::new() };
+            notes.push(format!("time.tau is not given: {tau} {unit}{words}, {why}"));
+            (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
+        }
+        let tau = map.tau;
         if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
             notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
         }

@@ -9,6 +9,8 @@ use crate::trust::Strata;
 
 /// Largest optical residual of the steps, as a part of `trust.tolerance`: where the surrogate has that residual, the steps add a fifth to it.
 const SHARE: f64 = 2.0 / 3.0;
+/// Smallest number of points on which something is to be seen.
+const MIN_SHOWN: usize = 64;
 /// Random stream of the points on which steps are compared.
 const STREAM: u64 = u64::MAX - 1;
 
@@ -22,9 +24,9 @@ pub(super) struct PictureSteps {
     pub(super) residual: f64,
 }
 
-/// Returns the smallest number of steps, below those `chosen` for the log-stretch, whose optical residual is at most [`SHARE`] of the tolerance.
-/// `None` if there is none, or if the method or the scene asks for the steps of the log-stretch. The colours are a coarser measure: they do not
-/// change where the FTLE is below or above the ramp.
+/// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most [`SHARE`]
+/// of the tolerance. `None` if there is none below those `chosen` for the log-stretch, if the method or the scene asks for these, or if too few points
+/// show anything to judge by.
 ///
 /// # Errors
 /// As for [`cpu_tracer`].
@@ -38,7 +40,8 @@ pub(super) fn picture_steps(
     let is_open = scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth();
     let Some(chosen) = chosen.filter(|choice| is_open && choice.within_tolerance) else { return Ok(None) };
     let cells = if plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
-    let unit = stratified_points(&Strata::even(cells, 1), scene.seed, STREAM);
+    // Not the seed of the picture, which would change the flow map.
+    let unit = stratified_points(&Strata::even(cells, 1), 0, STREAM);
     let mut points: Vec<[f32; 3]> = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
     // In double precision, as the steps of the log-stretch are chosen.
     let tracer = |steps: usize| {
@@ -49,17 +52,23 @@ pub(super) fn picture_steps(
     points.retain(|&point| !reference.is_missing(point));
     let (mut truth, mut traced) = (Traced::default(), Traced::default());
     reference.trace(&points, Extras::default(), &mut truth);
-    let unit = chosen.multiple_of;
+    let ramp = |s: f32| f64::from(transfer.ramp(s / plan.map.tau as f32));
+    if truth.log_stretch.iter().filter(|&&s| ramp(s) > 0.0).count() < MIN_SHOWN {
+        return Ok(None);
+    }
     let mut multiple = 1;
-    while multiple * unit < chosen.steps {
-        let steps = multiple * unit;
+    while multiple * chosen.multiple_of < chosen.steps {
+        let steps = multiple * chosen.multiple_of;
         tracer(steps)?.trace(&points, Extras::default(), &mut traced);
-        let ramp = |s: f32| transfer.ramp(s / plan.map.tau as f32);
-        // Where only one of the two has a value, the colours may differ as much as they can.
-        let residual = |a: f32, b: f32| if a.is_finite() && b.is_finite() { f64::from(ramp(a) - ramp(b)) } else { 1.0 };
-        let residual = upper_rms(&traced, &truth, residual);
+        let pairs = || traced.log_stretch.iter().copied().zip(truth.log_stretch.iter().copied());
+        let residual = upper_rms(pairs().map(|(a, b)| match (a.is_finite(), b.is_finite()) {
+            (true, true) => ramp(a) - ramp(b),
+            (false, false) => 0.0,
+            // The colours may differ as much as they can.
+            _ => 1.0,
+        }));
         if residual <= SHARE * scene.trust.tolerance {
-            let difference = upper_rms(&traced, &truth, |a, b| f64::from(a - b));
+            let difference = upper_rms(pairs().map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
             return Ok(Some(PictureSteps { steps, difference, residual }));
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
@@ -67,9 +76,9 @@ pub(super) fn picture_steps(
     Ok(None)
 }
 
-/// Root mean square over the points of both, from the mean square and its standard error added up: few points hold most of the difference.
-fn upper_rms(a: &Traced, b: &Traced, difference: impl Fn(f32, f32) -> f64) -> f64 {
-    let squares: Vec<f64> = a.log_stretch.iter().zip(&b.log_stretch).map(|(&a, &b)| difference(a, b).powi(2)).collect();
+/// Root mean square, from the mean square and its standard error added up: few points hold most of a difference.
+fn upper_rms(differences: impl Iterator<Item = f64>) -> f64 {
+    let squares: Vec<f64> = differences.map(|difference| difference * difference).collect();
     let n = squares.len().max(1) as f64;
     let mean = squares.iter().sum::<f64>() / n;
     let variance = squares.iter().map(|square| (square - mean).powi(2)).sum::<f64>() / n;

@@ -44,9 +44,13 @@ pub trait SnapshotSource: Send {
     /// Longest |tau| that is taken by default: half the span of the archive, at least two intervals, or the span if that is shorter.
     ///
     /// # Errors
-    /// Only one time.
+    /// Fewer than two times.
     fn longest_default_tau(&self) -> Result<f64, SourceError> {
         let (span, interval) = self.span_and_interval()?;
+        let found = self.times().len();
+        if found < 2 {
+            return Err(SourceError::TooShort { source_name: self.name(), tau: interval, needed: 2, found, interval, span });
+        }
         Ok((span / 2.0).max(2.0 * interval).min(span))
     }
 

@@ -86,7 +86,7 @@ fn a_field_has_the_units_of_its_source() {
         (&["--set", "archive.metric=index", "--set", "time.tau=2"], "snapshots", "snapshots"),
     ] {
         let (out, said) = succeeds(folder.path(), &[&["ftle", &file, "--grid", "9x5", "-o", "field.nc"][..], set].concat());
-        assert!(out.contains(&format!(" {unit}: tangent")) && said.contains("from that of more steps"), "{out}{said}");
+        assert!(out.contains(&format!(" {unit}: tangent")) && said.contains("from that of twice as many"), "{out}{said}");
         let field = netcdf::open(folder.path().join("field.nc")).unwrap();
         let text = |attribute: Option<netcdf::Attribute>| match attribute.unwrap().value().unwrap() {
             netcdf::AttributeValue::Str(text) => text,

@@ -28,6 +28,12 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
         assert_eq!(full.integration_residual, None, "tracking is the reference of other methods");
         assert!(3 * steps <= 2 * most, "{kind}: {steps} of {most} steps");
         assert_eq!(report(kind, keys, "marched", &[]).integration_steps, Some(steps));
+        for method in ["gated", "surrogate"] {
+            assert_eq!(report(kind, keys, method, &[]).integration_steps, Some(most), "{method}");
+        }
+        // Where the samples show nothing, nothing is told from it.
+        let unseen = report(kind, keys, "two_level", &["transfer.low=1e3", "transfer.high=2e3"]);
+        assert_eq!((unseen.integration_steps, unseen.integration_residual), (Some(most), None));
         // A tolerance of the user's is about the log-stretch.
         let obeyed = report(kind, keys, "two_level", &["flow.tolerance=0.01"]);
         assert_eq!(obeyed.integration_residual, None);

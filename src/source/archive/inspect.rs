@@ -104,8 +104,10 @@ pub struct TimeReport {
     pub unit: String,
     /// Intervals longer than one and a half times the median.
     pub gaps: Vec<TimeGap>,
-    /// |tau| for which the memory is stated: the requested one, or the default.
+    /// |tau| for which the memory is stated: the requested one, or the longest that is taken by default.
     pub tau: Option<f64>,
+    /// True if it was requested.
+    pub tau_is_given: bool,
     /// Number of snapshots in a window of this tau.
     pub window_snapshots: Option<usize>,
     /// Its memory in bytes.
@@ -296,6 +298,7 @@ fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: 
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
     let interval = median_interval(times);
     let steady = steady && times.len() == 1;
+    let tau_is_given = tau.is_some();
     let tau = match tau {
         Some(tau) if steady => Ok(tau),
         Some(tau) => archive.check_tau(tau).map(|()| tau),
@@ -315,6 +318,7 @@ fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: 
         window_bytes: snapshots.map(|s| s * archive.grid().nodes() * size_of::<[f32; 4]>()),
         tau_problem: tau.as_ref().err().map(ToString::to_string),
         tau: tau.ok(),
+        tau_is_given,
     }
 }
 
@@ -364,7 +368,14 @@ impl fmt::Display for Inspection {
             let calendar = self.source.as_ref().and_then(|s| s.calendar.as_deref()).unwrap_or("none");
             writeln!(f, "  calendar {calendar}, {} gap(s)", t.gaps.len())?;
             if let (Some(tau), Some(held), Some(bytes)) = (t.tau, t.window_snapshots, t.window_bytes) {
-                writeln!(f, "  tau {} {}: a window of {held} snapshots, {:.1} MiB", Short(tau), t.unit, bytes as f64 / f64::from(1 << 20))?;
+                let most = if t.tau_is_given { "" } else { "at most " };
+                writeln!(
+                    f,
+                    "  tau {most}{} {}: a window of {held} snapshots, {:.1} MiB",
+                    Short(tau),
+                    t.unit,
+                    bytes as f64 / f64::from(1 << 20)
+                )?;
             }
             if let Some(problem) = &t.tau_problem {
                 writeln!(f, "  {problem}")?;
