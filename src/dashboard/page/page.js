@@ -1,0 +1,252 @@
+// The page: brings messages, picture, charts and words together.
+import { Charts, rowOf } from "./charts.js";
+import { ColourBar } from "./colour_bar.js";
+import { Connection } from "./connection.js";
+import { Records } from "./history.js";
+import { Picture } from "./picture.js";
+import { followTheme, takeToken } from "./preferences.js";
+import { explainTerms } from "./terms.js";
+import { Warnings } from "./warnings.js";
+import { count, duration, facts, sentence } from "./words.js";
+
+const REFRESH = 250;
+// A sentence that is read aloud with every frame is of no use.
+const ANNOUNCE = 30_000;
+
+const element = (id) => document.getElementById(id);
+const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
+
+const records = new Records();
+const warnings = new Warnings();
+const colourBar = new ColourBar(element("colour-bar"));
+const picture = new Picture(element("frame"), pictureChanged);
+const charts = new Charts(element("charts"), (frame) => picture.lookBack(picture.kept.nearest(frame)));
+
+let connection;
+let newest = null;
+let server = null;
+let heard = null;
+let tolerance = null;
+let chartsDue = false;
+let logVersion = -1;
+let announced = { kind: null, at: 0 };
+
+// Messages
+
+/** Records that were not received before. A server repeats what it keeps to a client that returns. */
+function unseen(list) {
+  if (newest === null) return list;
+  const seen = list.findLastIndex((record) => record.frame === newest.frame && record.seconds?.elapsed === newest.seconds?.elapsed);
+  return list.slice(seen + 1);
+}
+
+function receiveRecords(list) {
+  const fresh = unseen(list.filter((record) => Number.isFinite(record?.frame)));
+  for (const record of fresh) {
+    const missing = records.missing;
+    if (records.add(rowOf(record))) beginRun(record.frame);
+    else if (records.missing > missing) warnings.hold("gaps", `${count(records.missing - missing)} records did not arrive`, record.frame);
+    newest = record;
+  }
+  warnings.read(fresh);
+  chartsDue ||= fresh.length > 0;
+}
+
+function beginRun(frame) {
+  warnings.forget();
+  tolerance = null;
+  warnings.hold("run", "A new run began", frame);
+}
+
+async function receiveFrame({ sequence, header, payload }, reply) {
+  try {
+    await picture.receive(header, payload);
+    if (Number.isFinite(header.tolerance)) tolerance = header.tolerance;
+  } catch (error) {
+    warnings.hold("picture", `The picture of frame ${count(header?.frame)} was skipped: ${error.message}`, header?.frame ?? null);
+  }
+  // Also for a skipped picture, or none would follow.
+  reply(sequence);
+}
+
+function receiveState(state) {
+  server = state;
+  heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
+}
+
+const RECEIVERS = {
+  frame: receiveFrame,
+  records: (message) => receiveRecords(Array.isArray(message.records) ? message.records : []),
+  state: receiveState,
+};
+
+// Showing
+
+const silence = () => (heard === null ? null : (performance.now() - heard) / 1000);
+
+function currentView() {
+  const back = picture.held && picture.shown?.header.record;
+  return {
+    link: connection.status,
+    retryAt: connection.retryAt,
+    status: server?.status,
+    endpoint: server?.endpoint,
+    refused: server?.refused,
+    silence: silence(),
+    record: newest,
+    back: back ? { record: back, behind: newest === null ? null : newest.frame - back.frame } : null,
+  };
+}
+
+function kindOf(view) {
+  if (view.link !== "open") return view.link;
+  if (view.status === "silent" || view.status === "waiting") return view.status;
+  return view.back ? "back" : "following";
+}
+
+const isStale = (kind) => kind === "lost" || kind === "refused" || kind === "silent";
+
+function pictureChanged(shown) {
+  const { record } = shown.header;
+  element("no-picture").hidden = true;
+  element("frame").setAttribute("aria-label", `FTLE field of frame ${count(shown.frame)}`);
+  colourBar.show(shown.header);
+  if (record) showFacts(facts(record, shown.header));
+  showPosition();
+  charts.mark(picture.held ? shown.frame : null);
+}
+
+function showFacts(values) {
+  for (const node of document.querySelectorAll("[data-fact]")) setText(node, values[node.dataset.fact]);
+}
+
+function showPosition() {
+  const [last, index] = [picture.kept.list.length - 1, picture.position()];
+  const scrub = element("scrub");
+  scrub.max = Math.max(last, 0);
+  scrub.value = Math.max(index, 0);
+  const text = picture.shown ? `frame ${count(picture.shown.frame)}` : "–";
+  setText(element("position"), text);
+  scrub.setAttribute("aria-valuetext", text);
+  element("live").setAttribute("aria-pressed", String(!picture.held));
+  setText(element("live"), picture.held ? "Back to live" : "Live");
+  element("earlier").disabled = index <= 0;
+  element("later").disabled = index >= last;
+}
+
+function conditionItem({ id, level, text, tick }) {
+  const item = element(`warning-${id}`) ?? Object.assign(document.createElement("li"), { id: `warning-${id}` });
+  if (item.childElementCount === 0) {
+    item.append(document.createElement("strong"), document.createElement("span"));
+    item.lastChild.ariaHidden = "true";
+  }
+  item.className = level;
+  setText(item.firstChild, text);
+  setText(item.lastChild, tick ?? "");
+  return item;
+}
+
+function showConditions(conditions) {
+  const list = element("warnings");
+  const items = conditions.map(conditionItem);
+  for (const old of [...list.children]) if (!items.includes(old)) old.remove();
+  items.forEach((item, index) => { if (list.children[index] !== item) list.insertBefore(item, list.children[index] ?? null); });
+}
+
+function logItem({ text, times, frame, at }) {
+  const item = document.createElement("li");
+  const when = document.createElement("time");
+  when.dateTime = at.toISOString();
+  when.textContent = at.toLocaleTimeString("en-GB");
+  item.append(when, ` ${frame === null ? "" : `frame ${count(frame)}: `}${text}${times > 1 ? ` (${count(times)} times)` : ""}`);
+  return item;
+}
+
+function showLog() {
+  if (warnings.log.version === logVersion) return;
+  logVersion = warnings.log.version;
+  const entries = warnings.log.newestFirst();
+  setText(element("message-count"), String(entries.length));
+  element("log").replaceChildren(...entries.map(logItem));
+}
+
+function announce(kind, text) {
+  const now = performance.now();
+  if (kind === announced.kind && now - announced.at < ANNOUNCE) return;
+  announced = { kind, at: now };
+  setText(element("announcement"), text);
+}
+
+function showState() {
+  const view = currentView();
+  const kind = kindOf(view);
+  const text = sentence(view);
+  setText(element("state"), text);
+  element("state").dataset.kind = kind;
+  setText(element("source"), newest?.source ?? "");
+  announce(kind, text);
+  showConditions(warnings.conditions(view));
+  const stale = isStale(kind) && picture.shown !== null;
+  element("stage").classList.toggle("stale", stale);
+  element("age").hidden = !stale;
+  if (stale) setText(element("age"), heard === null ? "old" : `${duration(silence())} old`);
+  setText(element("about"), server ? `ridgewatch ${server.version ?? ""} at ${server.endpoint ?? "–"}, ${count(server.clients)} watching` : "");
+}
+
+function refresh() {
+  showState();
+  showLog();
+  if (!chartsDue || document.hidden) return;
+  chartsDue = false;
+  element("no-charts").hidden = true;
+  charts.update(records.rows, tolerance);
+}
+
+// Controls
+
+const step = (by) => picture.lookBack(picture.position() + by);
+const toggleLive = () => (picture.held ? picture.follow() : picture.hold());
+
+function toggleFullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else element("picture").requestFullscreen?.().catch(() => warnings.log.add("This browser refuses full screen"));
+}
+
+const switchTheme = followTheme(() => charts.restyle());
+
+const KEYS = {
+  " ": toggleLive,
+  ArrowLeft: () => step(-1),
+  ArrowRight: () => step(1),
+  Home: () => picture.lookBack(0),
+  End: () => picture.follow(),
+  f: toggleFullScreen,
+  t: switchTheme,
+  "?": () => element("help").showModal(),
+};
+
+function pressKey(event) {
+  const { key, target } = event;
+  const used = event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
+  if (used || KEYS[key] === undefined) return;
+  event.preventDefault();
+  KEYS[key]();
+}
+
+element("live").addEventListener("click", toggleLive);
+element("earlier").addEventListener("click", () => step(-1));
+element("later").addEventListener("click", () => step(1));
+element("scrub").addEventListener("input", (event) => picture.lookBack(event.target.valueAsNumber));
+element("full-screen").addEventListener("click", toggleFullScreen);
+element("theme").addEventListener("click", switchTheme);
+element("open-help").addEventListener("click", () => element("help").showModal());
+document.addEventListener("keydown", pressKey);
+
+explainTerms(element("tip"), element("terms"));
+showPosition();
+connection = new Connection(takeToken(), {
+  message: (message, reply) => RECEIVERS[message.kind]?.(message, reply),
+  opened: () => { server = null; },
+  broken: (error) => warnings.hold("message", `A message of the server was skipped: ${error.message}`),
+});
+setInterval(refresh, REFRESH);

@@ -1,0 +1,89 @@
+// The picture: decoding, drawing, and looking back over the pictures that are kept.
+import { Pictures } from "./history.js";
+import { mediaType } from "./protocol.js";
+
+// From here on a picture looks better with visible pixels than smeared.
+const ENLARGED = 2;
+
+export class Picture {
+  /** `changed(picture)` is called with the picture that is now shown; null if there is none. */
+  constructor(canvas, changed) {
+    this.canvas = canvas;
+    this.changed = changed;
+    this.kept = new Pictures();
+    this.shown = null;
+    this.held = false;
+    this.wanted = null;
+    new ResizeObserver(() => this.sharpen()).observe(canvas);
+  }
+
+  /** Takes in a frame. Throws if it cannot be decoded. Returns whether a new run began with it. */
+  async receive(header, payload) {
+    const type = mediaType(header.encoding);
+    if (type === undefined) throw new Error(`its encoding is ${header.encoding}; this page shows jpeg and png`);
+    const blob = new Blob([payload], { type });
+    const bitmap = await createImageBitmap(blob);
+    const picture = { frame: header.frame, elapsed: header.record?.seconds?.elapsed ?? null, header, blob };
+    const restarted = this.kept.add(picture);
+    if (restarted) this.held = false;
+    if (this.held) this.changed(this.shown);
+    else this.draw(picture, bitmap);
+    bitmap.close();
+    return restarted;
+  }
+
+  draw(picture, bitmap) {
+    this.wanted = picture;
+    this.shown = picture;
+    if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
+      this.canvas.width = bitmap.width;
+      this.canvas.height = bitmap.height;
+      this.sharpen();
+    }
+    // Without the compositing of alpha that a picture may have, an older one would shine through.
+    this.canvas.getContext("2d").clearRect(0, 0, bitmap.width, bitmap.height);
+    this.canvas.getContext("2d").drawImage(bitmap, 0, 0);
+    this.changed(picture);
+  }
+
+  sharpen() {
+    const enlargement = (this.canvas.clientWidth * devicePixelRatio) / this.canvas.width;
+    this.canvas.classList.toggle("pixels", enlargement >= ENLARGED);
+  }
+
+  /** Position of the shown picture among the kept ones. */
+  position() {
+    const index = this.kept.list.indexOf(this.shown);
+    return index >= 0 || this.shown === null ? index : this.kept.nearest(this.shown.frame);
+  }
+
+  /** Stops at the picture that is shown. */
+  hold() {
+    if (this.shown === null) return;
+    this.held = true;
+    this.changed(this.shown);
+  }
+
+  /** Shows the newest picture, and each new one from now on. */
+  async follow() {
+    this.held = false;
+    await this.load(this.kept.list.at(-1));
+  }
+
+  /** Shows a kept picture and stays there. */
+  async lookBack(index) {
+    const last = this.kept.list.length - 1;
+    if (last < 0) return;
+    this.held = true;
+    await this.load(this.kept.list[Math.min(Math.max(index, 0), last)]);
+  }
+
+  async load(picture) {
+    if (picture === undefined) return;
+    this.wanted = picture;
+    const bitmap = await createImageBitmap(picture.blob);
+    // Meanwhile another one may have been asked for.
+    if (this.wanted === picture) this.draw(picture, bitmap);
+    bitmap.close();
+  }
+}

@@ -1,0 +1,59 @@
+// Terms of the trade, explained on hover, focus or tap. A term is `<button class="term" data-term="tau">`.
+
+const TERMS = {
+  ftle: "FTLE (finite-time Lyapunov exponent): how fast neighbouring particles part within the time tau. Its ridges separate regions that do not mix.",
+  t0: "t0: the time at which the particles are seeded.",
+  tau: "tau: how long particles are followed from t0, forward or backward in time.",
+  window: "Window: the span of flow data from t0 to t0 + tau (backward: − tau) that the picture needs.",
+  slide: "Slide: the window moves on by one step; frames of one slide refine the same picture.",
+  traced: "Traced: share of the picture's queries answered by integrating particle paths. The surrogate answered the rest, which is faster but approximate.",
+  tolerance: "Tolerance: largest error of the surrogate that is trusted, as a root mean square of the optical residual, in which 1 is the whole colour scale.",
+  psnr: "PSNR: how close the picture is to the exact one, over its lit pixels, in decibels. 40 dB is an error of 1 % of full brightness (root mean square), 20 dB 10 %.",
+  trusted: "Trusted: part of the domain in which the surrogate's measured error is within the tolerance.",
+  surrogate: "Surrogate: a table or neural network that predicts what tracing would give.",
+  lag: "Lag: seconds from the publication of a simulation step until the frame that contains it was finished. The way to this page is not included.",
+  loss: "Loss: what training of the surrogate minimises; smaller is better.",
+};
+
+const MARGIN = 8;
+
+/** A button that explains a term. */
+export function termButton(term, text) {
+  const button = document.createElement("button");
+  Object.assign(button, { type: "button", className: "term", textContent: text });
+  button.dataset.term = term;
+  button.setAttribute("aria-describedby", "tip");
+  return button;
+}
+
+function place(tip, anchor) {
+  const box = anchor.getBoundingClientRect();
+  const left = Math.min(box.left, innerWidth - tip.offsetWidth - MARGIN);
+  const below = box.bottom + MARGIN;
+  const top = below + tip.offsetHeight < innerHeight ? below : box.top - tip.offsetHeight - MARGIN;
+  tip.style.left = `${Math.max(MARGIN, left)}px`;
+  tip.style.top = `${Math.max(MARGIN, top)}px`;
+}
+
+/** Explains terms in `tip`, and lists them all in `list`. */
+export function explainTerms(tip, list) {
+  const hide = () => { tip.hidden = true; };
+  const show = (event) => {
+    const anchor = event.target.closest?.(".term");
+    if (!anchor) return;
+    tip.textContent = TERMS[anchor.dataset.term];
+    // In full screen only what is inside that element is drawn.
+    (document.fullscreenElement ?? document.body).append(tip);
+    tip.hidden = false;
+    place(tip, anchor);
+  };
+  for (const type of ["mouseover", "focusin", "click"]) document.addEventListener(type, show);
+  for (const type of ["mouseout", "focusout"]) document.addEventListener(type, (event) => event.target.closest?.(".term") && hide());
+  document.addEventListener("keydown", (event) => event.key === "Escape" && hide());
+  addEventListener("scroll", hide, { passive: true });
+  for (const text of Object.values(TERMS)) {
+    const item = document.createElement("li");
+    item.textContent = text;
+    list.append(item);
+  }
+}

@@ -1,0 +1,105 @@
+// Records in words and numbers. Unknown values are a dash or "unknown", never 0.
+
+export const DASH = "–";
+
+const known = (value) => typeof value === "number" && Number.isFinite(value);
+const whole = new Intl.NumberFormat("en-GB", { maximumFractionDigits: 0 });
+
+export const count = (value) => (known(value) ? whole.format(value) : DASH);
+
+/** Three significant digits, without an exponent where that is readable. */
+export function number(value, digits = 3) {
+  if (!known(value)) return DASH;
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(digits - 1).replace("-", "−").replace("e-", "e−").replace("e+", "e");
+  const decimals = size === 0 ? 0 : Math.max(0, digits - 1 - Math.floor(Math.log10(size)));
+  return String(Number(value.toFixed(decimals))).replace("-", "−");
+}
+
+export const withUnit = (value, unit) => (known(value) && unit ? `${number(value)} ${unit}` : number(value));
+export const percent = (share, digits = 2) => (known(share) ? `${number(100 * share, digits)} %` : DASH);
+
+/** A time of the source. Four decimals of the window keep neighbouring slides apart. */
+export const time = (value, unit, digits = 6) => (known(value) ? number(value, digits) + (unit ? ` ${unit}` : "") : DASH);
+
+/** Duration in seconds, as one reads it on a watch. */
+export function duration(seconds) {
+  if (!known(seconds)) return DASH;
+  if (seconds < 10) return `${seconds.toFixed(1)} s`;
+  if (seconds < 120) return `${Math.floor(seconds)} s`;
+  if (seconds < 7200) return `${Math.floor(seconds / 60)} min`;
+  return `${Math.floor(seconds / 3600)} h`;
+}
+
+/** Root mean square error as a share of full brightness, from a PSNR in decibels. */
+export const shareOfPeak = (psnr) => (known(psnr) ? 10 ** (-psnr / 20) : null);
+
+/** Seconds between the publication of a simulation step and the finished frame; null for other sources. */
+export function lag(record) {
+  const age = record?.live?.age;
+  return known(age) ? age + (record.seconds?.total ?? 0) : null;
+}
+
+function errorWords(record) {
+  const psnr = record.picture_error?.psnr?.value;
+  if (known(psnr)) return `error ${percent(shareOfPeak(psnr))} (${number(psnr, 2)} dB)`;
+  const trusted = record.trusted_error?.optical_rms;
+  return known(trusted) ? `error where trusted ${percent(trusted)}, of the picture unknown` : "error unknown";
+}
+
+function lagWords(record) {
+  if (!record.live) return null;
+  const behind = lag(record);
+  return known(behind) ? `${duration(behind)} behind the simulation` : "lag unknown";
+}
+
+const tracedWords = (record) => (known(record.traced_share) ? `${percent(record.traced_share)} traced` : "share traced unknown");
+
+/** Frame, slide, time, lag, error and share traced of a record. */
+export function frameWords(record) {
+  const when = record.date ? `t = ${record.date}` : `t = ${time(record.time, record.time_unit)}`;
+  return [`frame ${count(record.frame)}`, `slide ${count(record.slide)}`, when, lagWords(record), errorWords(record), tracedWords(record)]
+    .filter(Boolean)
+    .join(", ");
+}
+
+/** The sentence of state. `view` has `link`, `status`, `endpoint`, `silence` (seconds), `record` (newest) and `back` (`{ record, behind }` while looking back). */
+export function sentence(view) {
+  const words = view.record ? frameWords(view.record) : null;
+  if (view.back) return `Looking back, ${count(view.back.behind)} frames before the newest: ${frameWords(view.back.record)}.`;
+  if (view.link !== "open") {
+    const state = view.link === "connecting" ? "Connecting" : view.link === "refused" ? "Not admitted" : "Not connected";
+    return words ? `${state}; last seen: ${words}.` : `${state}.`;
+  }
+  if (view.status === "silent") return words ? `Silent for ${duration(view.silence)}; last: ${words}.` : `Silent for ${duration(view.silence)}.`;
+  if (words) return `Following, ${words}.`;
+  return view.endpoint ? `Waiting for the first frame from ${view.endpoint}.` : "Waiting for the first frame.";
+}
+
+/** Time span of the flow map: from t0 by tau, in the direction. */
+export function windowWords(record) {
+  if (!known(record.time) || !known(record.tau)) return DASH;
+  const end = record.direction === "backward" ? record.time - record.tau : record.time + record.tau;
+  return `${time(record.time)} to ${time(end, record.time_unit)}`;
+}
+
+/** Rows of the table beside the picture: term, text. */
+export function facts(record, header) {
+  const estimate = record.picture_error?.psnr;
+  const interval = estimate ? `${number(estimate.value)} dB, 95 % between ${number(estimate.low)} and ${number(estimate.high)}` : DASH;
+  return {
+    time: record.date ? `${record.date} (${time(record.time, record.time_unit)})` : time(record.time, record.time_unit),
+    tau: `${time(record.tau, record.time_unit)}, ${record.direction || "direction unknown"}`,
+    window: windowWords(record),
+    source: record.source || DASH,
+    method: [record.method, record.surrogate].filter(Boolean).join(", ") || DASH,
+    device: record.device || DASH,
+    size: `${record.size?.join(" × ") ?? DASH} pixels, ${number(record.samples_per_pixel)} samples a pixel`,
+    psnr: interval,
+    traced: `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
+    trusted: `${percent(record.trusted_volume)} of the domain`,
+    seconds: `${number(record.seconds?.total)} s`,
+    step: record.live ? `${count(record.live.step)}, ${count(record.live.snapshots)} in the window` : DASH,
+    picture: header ? `frame ${count(header.frame)}, ${header.encoding}` : DASH,
+  };
+}
