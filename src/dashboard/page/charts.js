@@ -50,7 +50,7 @@ const CHARTS = [
     bands: [[3, 2]],
   },
   {
-    title: "Error of the surrogate where trusted, and tolerance", term: "tolerance", needs: "trusted", floor: 0, share: true,
+    title: "Error where trusted, and tolerance", term: "tolerance", needs: "trusted", floor: 0, share: true,
     series: [
       line("trusted", "error, rms", "--orange", percent), ...interval("trustedLow", "trustedHigh", "--orange", percent),
       line("tolerance", "tolerance", "--vermillion", percent, { dash: [6, 4] }),
@@ -60,7 +60,7 @@ const CHARTS = [
   { title: "Share traced", term: "traced", floor: 0, ceiling: 1, share: true, series: [line("traced", "traced", "--green", percent)] },
   {
     title: "Frame time by stage", floor: 0, unit: "s", stacked: true,
-    series: STAGES.map((stage, index) => line(stage, stage, COLOURS[index], seconds, { stacked: true })),
+    series: STAGES.map((stage, index) => line(stage, stage, COLOURS[index], seconds, { width: 0 })),
     bands: STAGES.slice(1).map((_, index) => [index + 2, index + 1]),
   },
   {
@@ -110,12 +110,12 @@ function axes(spec) {
 }
 
 function seriesOptions(spec, rows) {
-  return spec.series.map(({ key, label, colour, words, width = 2, dash, scale = "y" }) => ({
-    label, dash, scale,
-    width: spec.stacked ? 1 : width,
+  return spec.series.map(({ key, label, colour, words, width = rem() / 8, dash, scale = "y" }, index) => ({
+    label, dash, scale, width,
     stroke: () => palette[colour],
-    fill: spec.stacked ? () => `${palette[colour]}cc` : undefined,
-    points: { show: () => width > 0 && !spec.stacked && rows().length < 40, size: 5 },
+    // The bands fill the others.
+    fill: spec.stacked && index === 0 ? () => palette[colour] : undefined,
+    points: { show: () => width > 0 && rows().length < 40, size: 5 },
     value: (_, __, ___, index) => (index === null ? DASH : words(rows()[index]?.[key] ?? null)),
   }));
 }
@@ -123,7 +123,7 @@ function seriesOptions(spec, rows) {
 function bands(spec) {
   return (spec.bands ?? []).map((series) => {
     const { colour } = spec.series[series[0] - 1];
-    return { series, fill: () => palette[colour] + (spec.stacked ? "cc" : "40") };
+    return { series, fill: () => palette[colour] + (spec.stacked ? "" : "40") };
   });
 }
 
@@ -162,11 +162,11 @@ export class Charts {
 
   size() {
     const shown = [...this.figures.values()].find((figure) => !figure.hidden);
-    return { width: Math.max(200, Math.floor(shown?.clientWidth ?? 0)), height: Math.round(10 * rem()) };
+    return { width: Math.max(200, Math.floor(shown?.clientWidth ?? 0)), height: Math.round(parseFloat(getComputedStyle(this.root).getPropertyValue("--height")) * rem()) };
   }
 
   plot(spec) {
-    const showLast = (plot) => { if (plot.cursor.idx == null && this.rows.length > 0) plot.setLegend({ idx: this.rows.length - 1 }, false); };
+    const showCurrent = (plot) => { if (plot.cursor.idx == null && this.rows.length > 0) plot.setLegend({ idx: this.current() }, false); };
     const options = {
       ...this.size(),
       cursor: { sync: { key: "frames" }, drag: { x: false, y: false }, points: { size: 7 } },
@@ -174,11 +174,17 @@ export class Charts {
       series: [{ label: "frame", value: (_, value) => (value === null ? DASH : number(value, 9)) }, ...seriesOptions(spec, () => this.rows)],
       bands: bands(spec),
       axes: axes(spec),
-      hooks: { draw: [(plot) => this.drawMark(plot)], setCursor: [showLast], setData: [showLast] },
+      hooks: { draw: [(plot) => this.drawMark(plot)], setCursor: [showCurrent], setData: [showCurrent] },
     };
     const plot = new uPlot(options, columns(spec, this.rows), this.figures.get(spec));
     plot.over.addEventListener("click", () => { if (plot.cursor.idx != null) this.choose(this.rows[plot.cursor.idx].frame); });
     return plot;
+  }
+
+  /** Index of the row whose values the legends show while the cursor is elsewhere. */
+  current() {
+    const marked = this.marked === null ? -1 : this.rows.findIndex((row) => row.frame >= this.marked);
+    return marked < 0 ? this.rows.length - 1 : marked;
   }
 
   drawMark(plot) {
@@ -189,6 +195,7 @@ export class Charts {
     ctx.save();
     ctx.strokeStyle = palette["--text"];
     ctx.lineWidth = 2 * devicePixelRatio;
+    ctx.setLineDash([]);
     ctx.beginPath();
     ctx.moveTo(x, bbox.top);
     ctx.lineTo(x, bbox.top + bbox.height);
@@ -214,7 +221,10 @@ export class Charts {
   mark(frame) {
     if (frame === this.marked) return;
     this.marked = frame;
-    for (const plot of this.plots.values()) plot.redraw(false);
+    for (const plot of this.plots.values()) {
+      plot.setLegend({ idx: this.current() }, false);
+      plot.redraw(false);
+    }
   }
 
   resize() {

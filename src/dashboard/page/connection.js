@@ -6,6 +6,8 @@ const LONGEST_DELAY = 15_000;
 // The server sends its state at least every second.
 const LONGEST_SILENCE = 6_000;
 const LONGEST_HANDSHAKE = 10_000;
+// The server closed this page in favour of others.
+const DISPLACED = 4001;
 
 const page = () => new URL("./", location.href);
 
@@ -20,7 +22,7 @@ function acknowledge(socket, sequence) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ ack: sequence }));
 }
 
-/** `status` is `connecting`, `open`, `lost` or `refused`; `retryAt` (milliseconds of `performance.now`) is set in the last two. */
+/** `status` is `connecting`, `open`, `lost`, `refused` or `displaced`; `retryAt` (milliseconds of `performance.now`) is set while the next attempt is due. */
 export class Connection {
   constructor(token, { message, opened, broken }) {
     Object.assign(this, { token, message, opened, broken });
@@ -28,7 +30,7 @@ export class Connection {
     this.retryAt = null;
     this.delay = FIRST_DELAY;
     this.open();
-    setInterval(() => this.check(), 1000);
+    this.timer = setInterval(() => this.check(), 1000);
   }
 
   open() {
@@ -38,7 +40,7 @@ export class Connection {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { this.status = "open"; this.retryAt = null; this.heard = performance.now(); this.opened(); };
     socket.onmessage = (event) => this.receive(socket, event.data);
-    socket.onclose = () => this.lose();
+    socket.onclose = ({ code }) => (code === DISPLACED ? this.stop() : this.lose());
   }
 
   receive(socket, data) {
@@ -67,6 +69,11 @@ export class Connection {
     if (neverOpened) this.askWhy();
   }
 
+  stop() {
+    clearInterval(this.timer);
+    this.status = "displaced";
+  }
+
   retry() {
     this.retryAt = null;
     this.open();
@@ -78,7 +85,10 @@ export class Connection {
     if (this.token) address.searchParams.set("token", this.token);
     try {
       const answer = await fetch(address, { method: "HEAD", signal: AbortSignal.timeout(5000) });
-      if (this.status !== "open") this.status = answer.status === 403 ? "refused" : "lost";
+      if (this.status === "open") return;
+      this.status = answer.status === 403 ? "refused" : "lost";
+      // The token may be of an earlier server, and the cookie, which all tabs share, of this one.
+      if (answer.status === 403) this.token = null;
     } catch {
       if (this.status !== "open") this.status = "lost";
     }

@@ -30,6 +30,17 @@ export class Records {
     return restarted;
   }
 
+  /** Whether a row of this frame and time of the run is kept. */
+  has({ frame, elapsed }) {
+    let [low, high] = [0, this.rows.length];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.rows[middle].frame < frame) low = middle + 1;
+      else high = middle;
+    }
+    return this.rows[low]?.frame === frame && this.rows[low].elapsed === elapsed;
+  }
+
   clear() {
     this.rows = [];
     this.missing = 0;

@@ -37,7 +37,7 @@ let announced = { kind: null, at: 0 };
 function unseen(list) {
   if (newest === null) return list;
   const seen = list.findLastIndex((record) => record.frame === newest.frame && record.seconds?.elapsed === newest.seconds?.elapsed);
-  return list.slice(seen + 1);
+  return list.slice(seen + 1).filter((record) => !records.has(rowOf(record)));
 }
 
 function receiveRecords(list) {
@@ -55,7 +55,7 @@ function receiveRecords(list) {
 function beginRun(frame) {
   warnings.forget();
   tolerance = null;
-  warnings.hold("run", "A new run began", frame);
+  warnings.hold("new", "A new run began", frame);
 }
 
 async function receiveFrame({ sequence, header, payload }, reply) {
@@ -91,7 +91,7 @@ function currentView() {
     retryAt: connection.retryAt,
     status: server?.status,
     endpoint: server?.endpoint,
-    refused: server?.refused,
+    problem: server?.problem,
     silence: silence(),
     record: newest,
     back: back ? { record: back, behind: newest === null ? null : newest.frame - back.frame } : null,
@@ -104,7 +104,7 @@ function kindOf(view) {
   return view.back ? "back" : "following";
 }
 
-const isStale = (kind) => kind === "lost" || kind === "refused" || kind === "silent";
+const STALE = ["lost", "refused", "displaced", "silent"];
 
 function pictureChanged(shown) {
   const { record } = shown.header;
@@ -186,7 +186,7 @@ function showState() {
   setText(element("source"), newest?.source ?? "");
   announce(kind, text);
   showConditions(warnings.conditions(view));
-  const stale = isStale(kind) && picture.shown !== null;
+  const stale = STALE.includes(kind) && picture.shown !== null && !picture.held;
   element("stage").classList.toggle("stale", stale);
   element("age").hidden = !stale;
   if (stale) setText(element("age"), heard === null ? "old" : `${duration(silence())} old`);

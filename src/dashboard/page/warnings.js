@@ -62,8 +62,13 @@ export class Warnings {
       this.hold("budget", `Tracing budget spent: ${count(overBudget)} queries in untrusted cells were answered by the surrogate`, frame, fresh);
     }
     if (checkpoint?.failed) this.hold("checkpoint", `A checkpoint could not be written: ${checkpoint.failed}`, frame, fresh);
-    for (const text of record.warnings ?? []) this.hold("run", String(text), frame, fresh);
+    this.readWarnings(record.warnings ?? [], frame, fresh);
     if (record.live) this.readLive(record, fresh);
+  }
+
+  readWarnings(texts, frame, fresh) {
+    for (const text of texts) this.hold("run", String(text), frame, fresh);
+    if (fresh && texts.length > 1) this.held.get("run").text += ` (and ${texts.length - 1} more: see the messages)`;
   }
 
   readLive({ live, frame, warnings }, fresh) {
@@ -103,13 +108,16 @@ function connectionConditions(view, now) {
     const text = "Not admitted: the token is missing or no longer valid. Open the address that ridgewatch printed.";
     return [{ id: "link", level: "critical", text }];
   }
+  if (view.link === "displaced") {
+    return [{ id: "link", level: "critical", text: "Too many pages are open, and this one was idle longest. Reload it to watch again." }];
+  }
   if (view.link === "lost") {
     const tick = view.retryAt === null ? "trying again" : `trying again in ${Math.max(0, Math.ceil((view.retryAt - now) / 1000))} s`;
     return [{ id: "link", level: "critical", text: "Connection to the dashboard's server lost.", tick }];
   }
   if (view.link !== "open") return [];
   const found = [];
-  if (view.refused) found.push({ id: "refused", level: "critical", text: view.refused });
+  if (view.problem) found.push({ id: "problem", level: "critical", text: view.problem });
   if (view.status === "silent") {
     found.push({ id: "silent", level: "critical", text: "Nothing new arrives: the run has ended, pauses, or is lost.", tick: `silent for ${silence}` });
   }

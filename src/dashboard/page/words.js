@@ -19,7 +19,7 @@ export function number(value, digits = 3) {
 export const withUnit = (value, unit) => (known(value) && unit ? `${number(value)} ${unit}` : number(value));
 export const percent = (share, digits = 2) => (known(share) ? `${number(100 * share, digits)} %` : DASH);
 
-/** A time of the source. Four decimals of the window keep neighbouring slides apart. */
+/** A time of the source, with enough digits to keep neighbouring slides apart. */
 export const time = (value, unit, digits = 6) => (known(value) ? number(value, digits) + (unit ? ` ${unit}` : "") : DASH);
 
 /** Duration in seconds, as one reads it on a watch. */
@@ -68,7 +68,7 @@ export function sentence(view) {
   const words = view.record ? frameWords(view.record) : null;
   if (view.back) return `Looking back, ${count(view.back.behind)} frames before the newest: ${frameWords(view.back.record)}.`;
   if (view.link !== "open") {
-    const state = view.link === "connecting" ? "Connecting" : view.link === "refused" ? "Not admitted" : "Not connected";
+    const state = { connecting: "Connecting", refused: "Not admitted" }[view.link] ?? "Not connected";
     return words ? `${state}; last seen: ${words}.` : `${state}.`;
   }
   if (view.status === "silent") return words ? `Silent for ${duration(view.silence)}; last: ${words}.` : `Silent for ${duration(view.silence)}.`;
@@ -99,7 +99,8 @@ export function facts(record, header) {
     traced: `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
     trusted: `${percent(record.trusted_volume)} of the domain`,
     seconds: `${number(record.seconds?.total)} s`,
-    step: record.live ? `${count(record.live.step)}, ${count(record.live.snapshots)} in the window` : DASH,
+    slide: count(record.slide),
+    step: record.live ? `step ${count(record.live.step)}, ${count(record.live.snapshots)} in the window` : DASH,
     picture: header ? `frame ${count(header.frame)}, ${header.encoding}` : DASH,
   };
 }
