@@ -1,0 +1,153 @@
+// What the tests share: the programs, a proxy as in front of a cluster's nodes, and a browser.
+import { chromium } from "playwright-core";
+import { spawn } from "node:child_process";
+import { once } from "node:events";
+import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
+import http from "node:http";
+import { tmpdir } from "node:os";
+import path from "node:path";
+import { createInterface } from "node:readline";
+import { WebSocket, WebSocketServer } from "ws";
+
+export const REPOSITORY = path.resolve(import.meta.dirname, "../../..");
+const PROGRAM = process.env.RIDGEWATCH ?? path.join(REPOSITORY, "target/release/ridgewatch");
+const CHROMIUM = process.env.CHROMIUM ?? "/usr/bin/chromium";
+const FLAGS = [
+  "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync",
+];
+// jupyter-server-proxy's clients accept messages of this length.
+export const MESSAGE_LIMIT = 10_000_000;
+export const TOKEN = "a-token-of-the-tests-0123456789abcdef";
+
+// Small pictures, several a second, so that silence is noticed within its shortest limit.
+const SMALL = { "render.width": 160, "render.height": 80, "render.samples": 1, "time.slides": 5000 };
+
+export function launch() {
+  return chromium.launch({ executablePath: CHROMIUM, args: FLAGS });
+}
+
+/** A folder that is removed at the end of the tests. */
+export function temporary() {
+  const folder = mkdtempSync(path.join(tmpdir(), "ridgewatch-dashboard-"));
+  process.on("exit", () => rmSync(folder, { recursive: true, force: true }));
+  return folder;
+}
+
+const children = new Set();
+process.on("exit", () => { for (const child of children) child.kill("SIGKILL"); });
+
+function start(args) {
+  const child = spawn(PROGRAM, args, { cwd: REPOSITORY, stdio: ["ignore", "pipe", "pipe"] });
+  children.add(child);
+  child.once("exit", () => children.delete(child));
+  child.log = "";
+  child.stderr.on("data", (text) => { child.log = (child.log + text).slice(-4000); });
+  return child;
+}
+
+export async function stop(child, signal = "SIGTERM") {
+  if (child.exitCode !== null || child.signalCode !== null) return;
+  child.kill(signal);
+  await once(child, "exit");
+}
+
+export function startPublisher(endpoint) {
+  const settings = Object.entries(SMALL).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
+  const child = start(["replay", "configs/double_gyre.toml", "--device", "cpu", "--publish", endpoint, ...settings]);
+  child.stdout.resume();
+  return child;
+}
+
+/** The server, and the port of its page. */
+export async function startDashboard(endpoint, folder, port = 0) {
+  const file = path.join(folder, "token");
+  writeFileSync(file, `${TOKEN}\n`, { mode: 0o600 });
+  const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json"]);
+  for await (const line of createInterface(child.stdout)) {
+    child.stdout.resume();
+    return { child, port: Number(new URL(JSON.parse(line).url).port) };
+  }
+  throw new Error(`the dashboard did not start: ${child.log}`);
+}
+
+/**
+ * A proxy that puts `prefix` before every path and keeps it, as Open OnDemand's /node/ does, and refuses long messages. `change(message)`, if set, may
+ * return other bytes for a message of the server.
+ */
+export class Proxy {
+  constructor(prefix) {
+    this.prefix = prefix;
+    this.target = 0;
+    this.change = null;
+    this.longest = 0;
+    this.upstreams = new Set();
+    this.server = http.createServer((request, response) => this.pass(request, response));
+    this.sockets = new WebSocketServer({ server: this.server });
+    this.sockets.on("connection", (client, request) => this.join(client, request));
+  }
+
+  async listen() {
+    await once(this.server.listen(0, "127.0.0.1"), "listening");
+    this.origin = `http://127.0.0.1:${this.server.address().port}`;
+  }
+
+  address(token = TOKEN) {
+    return `${this.origin}${this.prefix}?token=${token}`;
+  }
+
+  pass(request, response) {
+    if (!request.url.startsWith(this.prefix)) { response.writeHead(404).end(); return; }
+    const { method, headers, url } = request;
+    const upstream = http.request({ port: this.target, host: "127.0.0.1", path: url, method, headers }, (answer) => {
+      response.writeHead(answer.statusCode, answer.headers);
+      answer.pipe(response);
+    });
+    upstream.on("error", () => response.writeHead(502).end());
+    request.pipe(upstream);
+  }
+
+  join(client, { url, headers: { origin, cookie, host } }) {
+    const headers = Object.fromEntries(Object.entries({ origin, cookie, host }).filter(([, value]) => value !== undefined));
+    const upstream = new WebSocket(`ws://127.0.0.1:${this.target}${url}`, { headers, maxPayload: MESSAGE_LIMIT });
+    this.upstreams.add(upstream);
+    upstream.on("message", (data) => {
+      this.longest = Math.max(this.longest, data.length);
+      client.send(this.change?.(data) ?? data);
+    });
+    client.on("message", (data) => { if (upstream.readyState === WebSocket.OPEN) upstream.send(data.toString()); });
+    client.on("close", () => upstream.terminate());
+    upstream.on("close", () => { this.upstreams.delete(upstream); client.terminate(); });
+    upstream.on("error", () => client.terminate());
+  }
+
+  close() {
+    this.sockets.clients.forEach((client) => client.terminate());
+    this.server.close();
+    this.server.closeAllConnections();
+  }
+}
+
+/** Splits a message of the server. */
+export function parse(data) {
+  const length = data.readUInt32LE(0);
+  return { json: JSON.parse(data.subarray(4, 4 + length)), payload: data.subarray(4 + length) };
+}
+
+export function compose(json, payload) {
+  const text = Buffer.from(JSON.stringify(json));
+  const length = Buffer.alloc(4);
+  length.writeUInt32LE(text.length);
+  return Buffer.concat([length, text, payload]);
+}
+
+/** Waits until `probe` returns something true, and returns it. */
+export async function until(what, probe, milliseconds = 20_000) {
+  const end = Date.now() + milliseconds;
+  for (;;) {
+    const found = await probe();
+    if (found) return found;
+    if (Date.now() > end) throw new Error(`not within ${milliseconds} ms: ${what}`);
+    await new Promise((resolve) => setTimeout(resolve, 50));
+  }
+}

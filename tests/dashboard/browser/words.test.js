@@ -1,0 +1,88 @@
+// The words of the page: unknown values are said as unknown.
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { Warnings } from "../../../src/dashboard/page/warnings.js";
+import { duration, facts, lag, number, percent, sentence, shareOfPeak, windowWords } from "../../../src/dashboard/page/words.js";
+
+const record = {
+  frame: 8120, slide: 812, time: 3.2, time_unit: "s", date: null, tau: 2, direction: "backward", live: { age: 0.3 }, seconds: { total: 0.1 },
+  picture_error: { psnr: { value: 41, low: 40, high: 42 } }, traced_share: 0.12,
+};
+const following = { link: "open", status: "following", record };
+
+test("a followed simulation is told in one sentence", () => {
+  const expected = "Following, frame 8,120, slide 812, t = 3.2 s, 0.4 s behind the simulation, error 0.89 % (41 dB), 12 % traced.";
+  assert.equal(sentence(following), expected);
+});
+
+test("null and missing values are unknown and never 0", () => {
+  for (const none of [null, undefined]) {
+    const poor = { ...record, time: none, picture_error: none, trusted_error: none, traced_share: none, live: { age: none }, queries: none };
+    const expected = "Following, frame 8,120, slide 812, t = –, lag unknown, error unknown, share traced unknown.";
+    assert.equal(sentence({ ...following, record: poor }), expected);
+    assert.equal(facts(poor).traced, "– of – queries");
+    assert.equal(windowWords(poor), "–");
+    assert.equal(lag(poor), null);
+    assert.deepEqual([number(none), percent(none), duration(none), shareOfPeak(none)], ["–", "–", "–", null]);
+  }
+  assert.ok(Object.values(facts({})).every((text) => typeof text === "string" && !/undefined|null|NaN/.test(text)));
+});
+
+test("without a calendar or a simulation neither is mentioned", () => {
+  const text = sentence({ ...following, record: { ...record, live: null, time_unit: "" } });
+  assert.equal(text, "Following, frame 8,120, slide 812, t = 3.2, error 0.89 % (41 dB), 12 % traced.");
+});
+
+test("a lost connection, a silent publisher and looking back are said first", () => {
+  assert.match(sentence({ ...following, link: "lost" }), /^Not connected; last seen: frame 8,120/);
+  assert.match(sentence({ ...following, status: "silent", silence: 12.3 }), /^Silent for 12 s; last: frame 8,120/);
+  assert.match(sentence({ ...following, back: { record, behind: 20 } }), /^Looking back, 20 frames before the newest: frame 8,120/);
+  assert.equal(sentence({ link: "open", status: "waiting", endpoint: "ipc:///x" }), "Waiting for the first frame from ipc:///x.");
+});
+
+test("the window lies on the side of t0 to which particles are followed", () => {
+  assert.equal(windowWords(record), "3.2 to 1.2 s");
+  assert.equal(windowWords({ ...record, direction: "forward" }), "3.2 to 5.2 s");
+});
+
+test("numbers keep three digits", () => {
+  assert.deepEqual([0, 0.0123456, 1.23456, 123.456, 12345.6, -0.5, 1e-7].map((value) => number(value)), ["0", "0.0123", "1.23", "123", "12346", "−0.5", "1.00e−7"]);
+});
+
+const conditions = (warnings, view = { link: "open", status: "following" }) => warnings.conditions(view).map(({ id }) => id);
+
+test("what a frame warns of is a condition and a message", () => {
+  const warnings = new Warnings();
+  warnings.read([{ ...record, tolerance_excess: 0.004, over_budget: 3, live: { missed_blocks: 2, steps_incomplete: 0, steps_skipped: 1, restarts: 1, step: 5 } }]);
+  assert.deepEqual(conditions(warnings), ["tolerance", "budget", "drops", "coarse", "restart"]);
+  assert.equal(warnings.log.entries.size, 5);
+});
+
+test("counts that do not rise are no news", () => {
+  const warnings = new Warnings();
+  const live = { missed_blocks: 2, steps_incomplete: 1, steps_skipped: 4, restarts: 0, step: 5 };
+  warnings.read([{ ...record, live }]);
+  const before = warnings.log.version;
+  warnings.read([{ ...record, live: { ...live, step: 6 } }]);
+  assert.equal(warnings.log.version, before);
+});
+
+test("a lost simulation is told until its next step", () => {
+  const warnings = new Warnings();
+  const gone = "the simulation is gone: its process ended without closing the ring, or its relay is gone (block 0)";
+  warnings.read([{ ...record, live: { step: 7 }, warnings: [gone] }]);
+  warnings.read([{ ...record, live: { step: 7 }, warnings: [] }]);
+  assert.ok(conditions(warnings).includes("simulation"));
+  warnings.read([{ ...record, live: { step: 8 }, warnings: [] }]);
+  assert.ok(!conditions(warnings).includes("simulation"));
+});
+
+test("messages that differ in numbers are one, and the log is bounded", () => {
+  const warnings = new Warnings();
+  for (let time = 0; time < 500; time += 1) warnings.read([{ ...record, frame: time, warnings: [`snapshot repeats time ${time}.5`] }]);
+  assert.deepEqual(warnings.log.newestFirst().map(({ text, times }) => [text, times]), [["snapshot repeats time 499.5", 500]]);
+  const letters = (value) => String(value).replace(/\d/g, (digit) => "abcdefghij"[digit]);
+  for (let index = 0; index < 500; index += 1) warnings.log.add(letters(index));
+  assert.equal(warnings.log.entries.size, 100);
+  assert.equal(warnings.log.newestFirst()[0].text, letters(499));
+});
