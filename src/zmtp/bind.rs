@@ -108,21 +108,53 @@ impl Drop for SocketFile {
     }
 }
 
+/// Place that an endpoint names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Place<'a> {
+    Unix(&'a Path),
+    /// Host, without the brackets of an IPv6 address, and port.
+    Tcp(&'a str, u16),
+}
+
+impl<'a> Place<'a> {
+    /// Reads an endpoint; does not look up its host. The error is what is wrong.
+    pub fn of(endpoint: &'a str) -> Result<Self, String> {
+        if let Some(path) = endpoint.strip_prefix("ipc://") {
+            let bytes = path.len();
+            if !path.starts_with('/') || bytes > MAX_PATH {
+                return Err(format!("the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"));
+            }
+            return Ok(Self::Unix(Path::new(path)));
+        }
+        let address = endpoint.strip_prefix("tcp://").ok_or("neither tcp:// nor ipc://")?;
+        let (host, port) = address.rsplit_once(':').ok_or("it has no port")?;
+        let port: u16 = port.parse().map_err(|_| format!("`{port}` is not a port from 0 to 65535"))?;
+        match host.trim_start_matches('[').trim_end_matches(']') {
+            "" => Err("it has no host".to_owned()),
+            host => Ok(Self::Tcp(host, port)),
+        }
+    }
+}
+
+/// Checks an endpoint to connect to, without looking up its host.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn check_endpoint(endpoint: &str) -> Result<(), String> {
+    Place::of(endpoint).map(drop)
+}
+
 impl Bound {
     /// Binds an endpoint; returns it with the port that was bound.
     pub fn open(endpoint: &str) -> Result<(Self, String), BindError> {
-        if let Some(path) = endpoint.strip_prefix("ipc://") {
-            let (listener, file) = unix(Path::new(path))?;
-            return Ok((Self::Unix(listener, file), endpoint.to_owned()));
-        }
-        let wrong = |problem: String| BindError::Endpoint(problem);
-        let address = endpoint.strip_prefix("tcp://").ok_or_else(|| wrong("neither tcp:// nor ipc://".to_owned()))?;
-        let (host, port) = address.rsplit_once(':').ok_or_else(|| wrong("it has no port".to_owned()))?;
-        let port: u16 = port.parse().map_err(|_| wrong(format!("`{port}` is not a port from 0 to 65535")))?;
-        let host = match host.trim_start_matches('[').trim_end_matches(']') {
-            "" => return Err(wrong("it has no host".to_owned())),
-            "*" => "0.0.0.0",
-            host => host,
+        let wrong = BindError::Endpoint;
+        let (host, port) = match Place::of(endpoint).map_err(wrong)? {
+            Place::Unix(path) => {
+                let (listener, file) = unix(path)?;
+                return Ok((Self::Unix(listener, file), endpoint.to_owned()));
+            }
+            Place::Tcp("*", port) => ("0.0.0.0", port),
+            Place::Tcp(host, port) => (host, port),
         };
         let addresses: Vec<_> = (host, port).to_socket_addrs().map_err(|e| wrong(format!("host `{host}` is unknown: {e}")))?.collect();
         // The standard library sets SO_REUSEADDR, so that only a listener blocks the port, not connections of an earlier run.
@@ -153,12 +185,6 @@ fn in_use(error: io::Error) -> BindError {
 }
 
 fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
-    let bytes = path.as_os_str().len();
-    if !path.is_absolute() || bytes > MAX_PATH {
-        return Err(BindError::Endpoint(format!(
-            "the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"
-        )));
-    }
     // Two programs must not take each other's new socket for a left one.
     let _lock = lock_folder(path.parent().unwrap_or(path))?;
     let listener = match UnixListener::bind(path) {

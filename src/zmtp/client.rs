@@ -285,7 +285,7 @@ impl Outbox {
     }
 }
 
-fn greeting() -> [u8; GREETING] {
+pub(crate) fn greeting() -> [u8; GREETING] {
     let mut greeting = [0; GREETING];
     // The byte before 0x7f tells ZMTP 1 peers the length of an identity.
     [greeting[0], greeting[8], greeting[9], greeting[10], greeting[11]] = [0xff, 1, 0x7f, 3, 1];

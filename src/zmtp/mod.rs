@@ -1,4 +1,4 @@
-//! A ZeroMQ PUB socket (ZMTP 3.0 and 3.1, NULL mechanism) over TCP and Unix sockets, on one thread of its own.
+//! A ZeroMQ PUB socket (ZMTP 3.0 and 3.1, NULL mechanism) over TCP and Unix sockets, on one thread of its own; and one connection of a SUB socket.
 //!
 //! In: messages. Out: their bytes to each subscriber at that subscriber's pace. No subscriber costs another one anything: each has its own slots
 //! and its own deadline, what it may send is bounded ([`Limits`]), and a lock is held for the change of a queue, never across a read or a write.
@@ -9,12 +9,14 @@ mod message;
 mod owner;
 mod parse;
 mod socket;
+mod subscriber;
 
-pub use bind::{BindError, Peers, private_endpoint};
+pub use bind::{BindError, Peers, check_endpoint, private_endpoint};
 pub use client::Limits;
 pub use message::Keep;
 pub use parse::{Fault, Incoming, Parser};
 pub use socket::{Counts, PubSocket};
+pub use subscriber::{SubscribeError, Subscriber};
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
