@@ -3,7 +3,7 @@
 use super::exr::encode_exr;
 use super::preview::{jpeg, png, raw};
 use super::settings::Payload;
-use crate::run::{Frame, FrameRecord};
+use crate::run::{ColorBar, Frame, FrameRecord};
 use serde::{Deserialize, Serialize};
 
 /// First part of a message with a picture.
@@ -30,6 +30,9 @@ pub struct FrameHeader {
     pub payload_bytes: usize,
     /// `[contrast, brightness, gamma]` of 8-bit pictures, and the one to use for the others.
     pub tone_map: [f64; 3],
+    /// Colours of the transfer function, in 8 bits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub color_bar: Option<ColorBar>,
     /// Record of the frame.
     pub record: FrameRecord,
 }
@@ -54,6 +57,7 @@ pub fn encode_frame(frame: &Frame, payload: Payload) -> Result<(Vec<u8>, Vec<u8>
         dtype: dtype.to_owned(),
         payload_bytes: bytes.len(),
         tone_map: frame.tone_map,
+        color_bar: frame.color_bar.as_deref().cloned(),
         record: FrameRecord::clone(&frame.record),
     };
     Ok((serde_json::to_vec(&header).map_err(|e| e.to_string())?, bytes))

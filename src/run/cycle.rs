@@ -13,7 +13,7 @@ use super::steps::picture_steps;
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
-use super::{RunError, Settings, TransferRecord};
+use super::{ColorBar, RunError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
@@ -121,6 +121,7 @@ pub(super) struct Run<'a> {
     pub(super) report: &'a mut RunReport,
     pub(super) renderer: Renderer,
     pub(super) transfer: TransferRecord,
+    pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
     /// `None` if the run writes no checkpoints.
@@ -364,6 +365,7 @@ impl<'a> Run<'a> {
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
+        let color_bar = Arc::new(ColorBar::new(renderer.transfer(), [range.0, range.1], scene.render.tone_map, &plan.time_unit));
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
                 let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
@@ -399,7 +401,7 @@ impl<'a> Run<'a> {
         };
         let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
         let progress = RunProgress::default();
-        Ok(Self { plan, options, threads, stop, began, report, renderer, transfer, learning, progress, checkpoints })
+        Ok(Self { plan, options, threads, stop, began, report, renderer, transfer, color_bar, learning, progress, checkpoints })
     }
 }
 

@@ -134,7 +134,12 @@ impl Run<'_> {
         self.report.slides = slide.index + 1;
         self.progress.frame += 1;
         self.progress.pictures += u64::from(!place.is_warmup);
-        Ok(Frame { record: Arc::new(record), film: Arc::new(work.rendered.film), tone_map: scene.render.tone_map })
+        Ok(Frame {
+            record: Arc::new(record),
+            film: Arc::new(work.rendered.film),
+            tone_map: scene.render.tone_map,
+            color_bar: Some(Arc::clone(&self.color_bar)),
+        })
     }
 
     /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame

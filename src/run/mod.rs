@@ -5,6 +5,7 @@
 
 mod assess;
 mod checkpoints;
+mod color_bar;
 mod cycle;
 mod default_tau;
 mod error;
@@ -23,6 +24,7 @@ mod transaction;
 
 pub use crate::trust::TrustedError;
 pub use checkpoints::CheckpointTotals;
+pub use color_bar::ColorBar;
 pub use cycle::{Event, RunOptions, RunReport, run, run_on};
 pub use error::RunError;
 pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};

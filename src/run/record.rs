@@ -173,4 +173,6 @@ pub struct Frame {
     pub film: std::sync::Arc<crate::render::Film>,
     /// `[contrast, brightness, gamma]` for previews.
     pub tone_map: [f64; 3],
+    /// Colours of the transfer function.
+    pub color_bar: Option<std::sync::Arc<super::ColorBar>>,
 }
