@@ -1,0 +1,177 @@
+//! Who may see what: host, origin and token of a request.
+
+use super::error::DashboardError;
+use super::token::Token;
+use axum::http::header::{COOKIE, HOST, HeaderMap, HeaderName, ORIGIN};
+use axum::http::uri::{Authority, Uri};
+use std::net::{IpAddr, SocketAddr};
+
+/// Why a request is refused, for the one who asks.
+pub(super) type Refused = &'static str;
+
+const NO_TOKEN: Refused = "This page needs its token: open the address that ridgewatch printed.\n";
+const HOST_REFUSED: Refused = "The host name of this address is not accepted: use localhost, or start ridgewatch with --allow-host and the name that the browser shows.\n";
+const ORIGIN_REFUSED: Refused = "Pages of other origins are not served.\n";
+
+/// Checks requests.
+#[derive(Debug)]
+pub(super) struct Access {
+    token: Token,
+    /// Lower case.
+    hosts: Vec<String>,
+    address: SocketAddr,
+}
+
+impl Access {
+    pub fn new(token: Token, hosts: Vec<String>, address: SocketAddr) -> Result<Self, DashboardError> {
+        for host in &hosts {
+            // Also refuses what has a user, a port, a path or a scheme.
+            let is_name = host.parse::<Authority>().is_ok_and(|parsed| parsed.host() == host);
+            if !is_name {
+                return Err(DashboardError::HostName(host.clone()));
+            }
+        }
+        Ok(Self { token, hosts: hosts.iter().map(|host| host.to_ascii_lowercase()).collect(), address })
+    }
+
+    /// Refuses names that a stranger may have pointed at this machine (DNS rebinding).
+    pub fn check_host(&self, headers: &HeaderMap) -> Result<(), Refused> {
+        let host = only(headers, HOST).and_then(|host| host.parse::<Authority>().ok()).ok_or(HOST_REFUSED)?;
+        if self.accepts(host.host()) { Ok(()) } else { Err(HOST_REFUSED) }
+    }
+
+    fn accepts(&self, host: &str) -> bool {
+        let name = host.to_ascii_lowercase();
+        let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>().map(|address| address.to_canonical());
+        match address {
+            // A browser that names an address reaches that address. Who listens for others is reached at addresses that are not known here.
+            Ok(address) if address.is_loopback() || !self.address.ip().is_loopback() => true,
+            _ => name == "localhost" || self.hosts.contains(&name),
+        }
+    }
+
+    /// Refuses connections that a page of another origin opens, which would come with the cookie. Programs that are no browser send no origin.
+    pub fn check_origin(&self, headers: &HeaderMap) -> Result<(), Refused> {
+        if !headers.contains_key(ORIGIN) {
+            return Ok(());
+        }
+        let origin = only(headers, ORIGIN).and_then(|origin| origin.parse::<Uri>().ok()).ok_or(ORIGIN_REFUSED)?;
+        let host = only(headers, HOST).and_then(|host| host.parse::<Authority>().ok()).ok_or(HOST_REFUSED)?;
+        let name = origin.host().ok_or(ORIGIN_REFUSED)?;
+        let default = if origin.scheme_str() == Some("https") { 443 } else { 80 };
+        let is_same = name.eq_ignore_ascii_case(host.host()) && origin.port_u16().unwrap_or(default) == host.port_u16().unwrap_or(default);
+        // Some proxies put a name of their own in place of the host that the browser sent.
+        if is_same || self.hosts.iter().any(|host| name.eq_ignore_ascii_case(host)) { Ok(()) } else { Err(ORIGIN_REFUSED) }
+    }
+
+    /// Accepts the token in the query, or else in the cookie.
+    pub fn check_token(&self, uri: &Uri, headers: &HeaderMap) -> Result<(), Refused> {
+        let query = uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix("token="));
+        let name = self.cookie_name();
+        let cookie = || {
+            let lines = headers.get_all(COOKIE).iter().filter_map(|line| line.to_str().ok());
+            let mut cookies = lines.flat_map(|line| line.split(';')).filter_map(|cookie| cookie.trim().split_once('='));
+            cookies.find(|(key, _)| *key == name).map(|(_, value)| value)
+        };
+        let given = query.or_else(cookie);
+        if given.is_some_and(|given| self.token.is(given)) { Ok(()) } else { Err(NO_TOKEN) }
+    }
+
+    /// Cookie by which a browser keeps the token. Without a path it is sent to the folder of the page alone, whatever path a proxy gives it.
+    pub fn cookie(&self) -> String {
+        format!("{}={}; HttpOnly; SameSite=Strict", self.cookie_name(), self.token.secret())
+    }
+
+    /// Ports of a host share their cookies.
+    fn cookie_name(&self) -> String {
+        format!("ridgewatch-{}", self.address.port())
+    }
+}
+
+/// Value of a header that may come once.
+fn only(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
+    let mut values = headers.get_all(name).iter();
+    values.next().filter(|_| values.next().is_none())?.to_str().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axum::http::HeaderValue;
+
+    fn access(hosts: &[&str], address: &str) -> Access {
+        Access::new(Token::random().unwrap(), hosts.iter().map(|host| (*host).to_owned()).collect(), address.parse().unwrap()).unwrap()
+    }
+
+    fn headers(pairs: &[(HeaderName, &str)]) -> HeaderMap {
+        pairs.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap())).collect()
+    }
+
+    #[test]
+    fn hosts_of_the_loopback_and_allowed_ones_are_accepted() {
+        let local = access(&["Portal.example.org"], "127.0.0.1:8577");
+        let open = access(&[], "0.0.0.0:8577");
+        for (host, by_local, by_open) in [
+            ("localhost:8577", true, true),
+            ("LOCALHOST", true, true),
+            ("127.0.0.1:9000", true, true),
+            ("[::1]:8577", true, true),
+            ("portal.example.org", true, false),
+            ("192.0.2.7:8577", false, true),
+            ("evil.example.org:8577", false, false),
+            ("localhost.evil.org", false, false),
+            ("127.0.0.1.evil.org", false, false),
+            ("127.0.0.1@evil.org", false, false),
+            ("", false, false),
+        ] {
+            let headers = headers(&[(HOST, host)]);
+            assert_eq!(local.check_host(&headers).is_ok(), by_local, "{host}");
+            assert_eq!(open.check_host(&headers).is_ok(), by_open, "{host}");
+        }
+        assert!(local.check_host(&HeaderMap::new()).is_err());
+        let twice: HeaderMap = {
+            let mut twice = headers(&[(HOST, "localhost")]);
+            twice.append(HOST, HeaderValue::from_static("evil.org"));
+            twice
+        };
+        assert!(local.check_host(&twice).is_err());
+        for odd in ["https://portal.example.org", "portal.example.org:443", "portal.example.org/", "a b", "me@portal.example.org", ""] {
+            assert!(Access::new(Token::random().unwrap(), vec![odd.to_owned()], "127.0.0.1:1".parse().unwrap()).is_err(), "{odd}");
+        }
+    }
+
+    #[test]
+    fn only_the_own_origin_is_accepted() {
+        let access = access(&["portal.example.org"], "127.0.0.1:8577");
+        for (origin, host, accepted) in [
+            ("http://127.0.0.1:8577", "127.0.0.1:8577", true),
+            ("https://localhost", "localhost:443", true),
+            ("http://localhost", "localhost", true),
+            // Another server on this machine, maybe of another user.
+            ("http://127.0.0.1:8578", "127.0.0.1:8577", false),
+            ("http://localhost:8577", "127.0.0.1:8577", false),
+            ("https://portal.example.org", "node17:8577", true),
+            ("https://evil.example.org", "127.0.0.1:8577", false),
+            ("null", "127.0.0.1:8577", false),
+            ("file://", "127.0.0.1:8577", false),
+        ] {
+            let headers = headers(&[(ORIGIN, origin), (HOST, host)]);
+            assert_eq!(access.check_origin(&headers).is_ok(), accepted, "{origin} {host}");
+        }
+        assert!(access.check_origin(&headers(&[(HOST, "127.0.0.1:8577")])).is_ok(), "no browser");
+    }
+
+    #[test]
+    fn the_token_comes_by_query_or_cookie() {
+        let access = access(&[], "127.0.0.1:8577");
+        let token = access.token.secret().to_owned();
+        let check =
+            |query: &str, cookie: &str| access.check_token(&format!("/{query}").parse().unwrap(), &headers(&[(COOKIE, cookie)])).is_ok();
+        assert!(check(&format!("?token={token}"), "") && check(&format!("?a=1&token={token}"), ""));
+        assert!(check("", &format!("a=b; ridgewatch-8577={token}")));
+        assert!(access.cookie().starts_with(&format!("ridgewatch-8577={token};")));
+        assert!(!check("", "") && !check("?token=", "") && !check(&format!("?token={}", &token[1..]), ""));
+        assert!(!check("", &format!("ridgewatch-8578={token}")), "of another port");
+        assert!(!check("?token=wrong", &format!("ridgewatch-8577={token}")), "a wrong token is not forgiven");
+    }
+}

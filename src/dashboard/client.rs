@@ -1,0 +1,131 @@
+//! One browser: pictures at its pace, records, and the state of the publisher.
+
+use super::hub::Hub;
+use axum::extract::ws::{CloseFrame, Message, WebSocket};
+use bytes::Bytes;
+use serde::Deserialize;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
+
+/// Interval of messages about the publisher.
+const STATE: Duration = Duration::from_secs(1);
+/// Silence after which a browser is sent a ping. After as much again it is disconnected.
+const SILENCE: Duration = Duration::from_secs(10);
+/// Longest time for one message to be taken.
+const STALL: Duration = Duration::from_secs(20);
+/// Code of the end of a connection whose place another one took; the page does not come back by itself.
+const DISPLACED: u16 = 4001;
+/// Code of a message that is not understood (RFC 6455, 7.4.1).
+const POLICY: u16 = 1008;
+
+/// What the page says.
+#[derive(Debug, Deserialize)]
+struct Said {
+    ack: u64,
+}
+
+/// Why a connection ends. Errors of the network need no answer.
+enum End {
+    Gone,
+    Closed(u16, &'static str),
+}
+
+enum Turn {
+    Heard(Option<Result<Message, axum::Error>>),
+    Picture,
+    Records,
+    Tick,
+    Displaced,
+}
+
+/// Serves a browser until it leaves, is lost, or loses its place.
+pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
+    if let End::Closed(code, reason) = talk(&mut socket, hub).await {
+        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        let _ = timeout(STATE, socket.send(close)).await;
+    }
+}
+
+async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
+    let place = hub.enter();
+    let (mut pictures, mut recorded) = (hub.picture.subscribe(), hub.recorded.subscribe());
+    // What is there already is news to this browser.
+    pictures.mark_changed();
+    recorded.mark_changed();
+    let mut ticks = interval(STATE);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    // Sequence of the picture that it is drawing.
+    let mut drawing: Option<u64> = None;
+    let (mut next_record, mut heard, mut has_pinged) = (0, Instant::now(), false);
+    loop {
+        let turn = tokio::select! {
+            message = socket.recv() => Turn::Heard(message),
+            () = place.displaced.notified() => Turn::Displaced,
+            // The hub outlives this.
+            _ = pictures.changed(), if drawing.is_none() => Turn::Picture,
+            _ = recorded.changed() => Turn::Records,
+            _ = ticks.tick() => Turn::Tick,
+        };
+        let sent = match turn {
+            Turn::Heard(Some(Ok(message))) => {
+                (heard, has_pinged) = (Instant::now(), false);
+                match message {
+                    Message::Text(text) => match serde_json::from_str::<Said>(&text) {
+                        Ok(Said { ack }) => {
+                            drawing = drawing.filter(|sequence| *sequence != ack);
+                            place.is_active();
+                        }
+                        Err(_) => return End::Closed(POLICY, "a message that is not understood; accepted: {\"ack\":N}"),
+                    },
+                    Message::Binary(_) => return End::Closed(POLICY, "a binary message; accepted: {\"ack\":N} as text"),
+                    Message::Close(_) => return End::Gone,
+                    // Pings are answered by the library.
+                    Message::Ping(_) | Message::Pong(_) => {}
+                }
+                Ok(())
+            }
+            Turn::Heard(_) => return End::Gone,
+            Turn::Displaced => return End::Closed(DISPLACED, "too many pages are open; this one has drawn nothing for longest"),
+            Turn::Picture => {
+                let newest = pictures.borrow_and_update().clone();
+                match newest {
+                    Some(picture) => {
+                        drawing = Some(picture.sequence);
+                        send(socket, picture.message.clone()).await
+                    }
+                    None => Ok(()),
+                }
+            }
+            Turn::Records => {
+                let mut sent = Ok(());
+                while let (Ok(()), Some((message, next))) = (&sent, hub.records_from(next_record)) {
+                    sent = send(socket, message).await;
+                    next_record = next;
+                }
+                sent
+            }
+            Turn::Tick if heard.elapsed() > 2 * SILENCE => return End::Gone,
+            Turn::Tick => {
+                if heard.elapsed() > SILENCE && !has_pinged {
+                    has_pinged = true;
+                    if timeout(STALL, socket.send(Message::Ping(Bytes::new()))).await.is_err() {
+                        return End::Gone;
+                    }
+                }
+                send(socket, hub.state()).await
+            }
+        };
+        if sent.is_err() {
+            return End::Gone;
+        }
+    }
+}
+
+/// Sends a message, which the browser must take in time.
+async fn send(socket: &mut WebSocket, message: Bytes) -> Result<(), ()> {
+    match timeout(STALL, socket.send(Message::Binary(message))).await {
+        Ok(Ok(())) => Ok(()),
+        _ => Err(()),
+    }
+}

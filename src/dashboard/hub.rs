@@ -1,0 +1,331 @@
+//! What all browsers share: the newest picture, the latest records, the state of the publisher.
+
+use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
+use bytes::Bytes;
+use ridgewatch_zmtp::{SubscribeError, Subscriber};
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
+use std::io::ErrorKind;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use tokio::sync::{Notify, watch};
+
+/// Maximum length of a published message, in bytes: a lossless picture of 16 million pixels.
+const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Maximum length of the JSON of a message, in bytes.
+const MAX_JSON_BYTES: usize = 256 << 10;
+/// Records that are kept for browsers that come later, and their bytes.
+const MAX_KEPT_RECORDS: usize = 2000;
+const MAX_KEPT_BYTES: usize = 16 << 20;
+/// Bytes of records in one message. Some proxies accept 10 MB.
+const MAX_BATCH_BYTES: usize = 4 << 20;
+/// Maximum number of browsers.
+const MAX_CLIENTS: usize = 64;
+/// Shortest time between two attempts to reach the publisher.
+const RECONNECT: Duration = Duration::from_millis(500);
+/// Silence after which a publisher counts as silent, if it is also so many times the usual interval of its records.
+const SILENT: Duration = Duration::from_secs(3);
+const SILENT_INTERVALS: u32 = 5;
+/// Intervals whose median is the usual one.
+const INTERVALS: usize = 9;
+
+/// A picture as it is sent to every browser.
+#[derive(Debug)]
+pub(super) struct Picture {
+    pub sequence: u64,
+    pub message: Bytes,
+}
+
+/// What all browsers share.
+#[derive(Debug)]
+pub(super) struct Hub {
+    endpoint: String,
+    pub picture: watch::Sender<Option<Arc<Picture>>>,
+    /// Number of records so far.
+    pub recorded: watch::Sender<u64>,
+    records: Mutex<Records>,
+    health: Mutex<Health>,
+    clients: Mutex<Clients>,
+}
+
+/// The latest records, as JSON.
+#[derive(Debug, Default)]
+struct Records {
+    kept: VecDeque<Arc<str>>,
+    bytes: usize,
+    /// Number of the first one that is kept.
+    first: u64,
+}
+
+#[derive(Debug, Default)]
+struct Health {
+    last_message: Option<Instant>,
+    last_record: Option<Instant>,
+    intervals: VecDeque<Duration>,
+    problem: Option<String>,
+}
+
+#[derive(Debug, Default)]
+struct Clients {
+    next: u64,
+    there: Vec<Member>,
+}
+
+/// A browser.
+#[derive(Debug)]
+struct Member {
+    number: u64,
+    /// Last sign that it shows pictures.
+    active: Instant,
+    displaced: Arc<Notify>,
+}
+
+/// A place among the browsers, until it is dropped.
+#[derive(Debug)]
+pub(super) struct Place {
+    hub: Arc<Hub>,
+    number: u64,
+    /// Notified when the place is given to another one.
+    pub displaced: Arc<Notify>,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        lock(&self.hub.clients).there.retain(|member| member.number != self.number);
+    }
+}
+
+impl Place {
+    /// The browser has drawn a picture.
+    pub fn is_active(&self) {
+        if let Some(member) = lock(&self.hub.clients).there.iter_mut().find(|member| member.number == self.number) {
+            member.active = Instant::now();
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Status {
+    /// Nothing was received yet.
+    Waiting,
+    Following,
+    /// Nothing for long: the publisher has stopped, paused or is lost.
+    Silent,
+}
+
+/// Message about the publisher.
+#[derive(Debug, Serialize)]
+struct State<'a> {
+    kind: &'static str,
+    endpoint: &'a str,
+    status: Status,
+    seconds_since_message: Option<f64>,
+    clients: usize,
+    version: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    problem: Option<String>,
+}
+
+/// What must be known of a picture's header. The page reads the rest.
+#[derive(Debug, Deserialize)]
+struct Head {
+    encoding: String,
+    payload_bytes: usize,
+}
+
+impl Hub {
+    pub fn new(endpoint: String) -> Self {
+        Self {
+            endpoint,
+            picture: watch::Sender::new(None),
+            recorded: watch::Sender::new(0),
+            records: Mutex::default(),
+            health: Mutex::default(),
+            clients: Mutex::default(),
+        }
+    }
+
+    /// Takes a place. If all are taken, the browser that has drawn nothing for longest loses its own.
+    pub fn enter(self: &Arc<Self>) -> Place {
+        let mut clients = lock(&self.clients);
+        if clients.there.len() >= MAX_CLIENTS
+            && let Some((idlest, _)) = clients.there.iter().enumerate().min_by_key(|(_, member)| member.active)
+        {
+            clients.there.swap_remove(idlest).displaced.notify_one();
+        }
+        let (number, displaced) = (clients.next, Arc::new(Notify::new()));
+        clients.next += 1;
+        clients.there.push(Member { number, active: Instant::now(), displaced: Arc::clone(&displaced) });
+        Place { hub: Arc::clone(self), number, displaced }
+    }
+
+    /// Follows the publisher, and reaches it again when it is lost. Never ends.
+    pub async fn follow(&self) {
+        loop {
+            let begin = tokio::time::Instant::now();
+            match Subscriber::connect(&self.endpoint, &[FRAME_TOPIC, RECORD_TOPIC], MAX_MESSAGE_BYTES).await {
+                Ok(mut subscriber) => loop {
+                    match subscriber.receive().await {
+                        Ok(parts) => self.take(&parts),
+                        Err(error) => break self.lost(&error),
+                    }
+                },
+                Err(error) => self.lost(&error),
+            }
+            tokio::time::sleep_until(begin + RECONNECT).await;
+        }
+    }
+
+    /// A publisher that is not there is waited for; anything else is said.
+    fn lost(&self, error: &SubscribeError) {
+        tracing::debug!("{}: {error}", self.endpoint);
+        let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused, ErrorKind::UnexpectedEof, ErrorKind::ConnectionReset];
+        match error {
+            SubscribeError::System(error) if absent.contains(&error.kind()) => {}
+            error => lock(&self.health).problem = Some(format!("the publisher cannot be followed: {error}")),
+        }
+    }
+
+    /// Takes a published message.
+    fn take(&self, parts: &[Bytes]) {
+        let taken = match parts {
+            [topic, record] if topic == RECORD_TOPIC => self.take_record(record),
+            [topic, header, picture] if topic == FRAME_TOPIC => self.take_picture(header, picture),
+            _ => Err(format!("a message of {} parts; accepted: frame (3 parts) and record (2 parts)", parts.len())),
+        };
+        let mut health = lock(&self.health);
+        health.last_message = Some(Instant::now());
+        match taken {
+            Ok(()) => health.problem = None,
+            Err(problem) => health.problem = Some(problem),
+        }
+    }
+
+    fn take_record(&self, json: &[u8]) -> Result<(), String> {
+        #[derive(Deserialize)]
+        struct Numbered {
+            #[serde(rename = "frame")]
+            _frame: u64,
+        }
+        let (record, Numbered { .. }) = checked(json)?;
+        lock(&self.health).note_record(Instant::now());
+        lock(&self.records).keep(record.into());
+        self.recorded.send_modify(|count| *count += 1);
+        Ok(())
+    }
+
+    fn take_picture(&self, header: &[u8], picture: &[u8]) -> Result<(), String> {
+        #[derive(Deserialize)]
+        struct Protocol {
+            protocol: u32,
+        }
+        let (header, Protocol { protocol }) = checked(header)?;
+        if protocol != PROTOCOL {
+            return Err(format!("the publisher speaks protocol {protocol}; accepted: {PROTOCOL}"));
+        }
+        let (_, Head { encoding, payload_bytes }) = checked(header.as_bytes())?;
+        if !["jpeg", "png"].contains(&encoding.as_str()) {
+            return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg and png (publish.payload)"));
+        }
+        if payload_bytes != picture.len() {
+            return Err(format!("a picture of {} bytes, of which its header says {payload_bytes}", picture.len()));
+        }
+        self.picture.send_modify(|newest| {
+            let sequence = newest.as_ref().map_or(1, |newest| newest.sequence + 1);
+            let json = format!(r#"{{"kind":"frame","sequence":{sequence},"header":{header}}}"#);
+            *newest = Some(Arc::new(Picture { sequence, message: message(&json, picture) }));
+        });
+        Ok(())
+    }
+
+    /// Message with the records from number `from` on, and the number after the last of them. `None` if there are none.
+    pub fn records_from(&self, from: u64) -> Option<(Bytes, u64)> {
+        let (batch, skipped, next) = lock(&self.records).from(from)?;
+        let json = format!(r#"{{"kind":"records","records":[{}],"skipped":{skipped}}}"#, batch.join(","));
+        Some((message(&json, &[]), next))
+    }
+
+    /// Message about the publisher.
+    pub fn state(&self) -> Bytes {
+        let clients = lock(&self.clients).there.len();
+        let health = lock(&self.health);
+        let silence = health.last_message.map(|last| last.elapsed());
+        let state = State {
+            kind: "state",
+            endpoint: &self.endpoint,
+            status: health.status(silence),
+            seconds_since_message: silence.map(|silence| silence.as_secs_f64()),
+            clients,
+            version: env!("CARGO_PKG_VERSION"),
+            problem: health.problem.clone(),
+        };
+        message(&serde_json::to_string(&state).unwrap_or_default(), &[])
+    }
+}
+
+impl Health {
+    fn note_record(&mut self, now: Instant) {
+        if let Some(before) = self.last_record.replace(now) {
+            if self.intervals.len() == INTERVALS {
+                self.intervals.pop_front();
+            }
+            self.intervals.push_back(now - before);
+        }
+    }
+
+    fn status(&self, silence: Option<Duration>) -> Status {
+        let Some(silence) = silence else { return Status::Waiting };
+        let mut sorted: Vec<_> = self.intervals.iter().copied().collect();
+        sorted.sort_unstable();
+        let usual = sorted.get(sorted.len() / 2).copied().unwrap_or_default();
+        if silence > SILENT.max(usual * SILENT_INTERVALS) { Status::Silent } else { Status::Following }
+    }
+}
+
+impl Records {
+    fn keep(&mut self, record: Arc<str>) {
+        self.bytes += record.len();
+        self.kept.push_back(record);
+        while self.kept.len() > MAX_KEPT_RECORDS || self.bytes > MAX_KEPT_BYTES {
+            let Some(oldest) = self.kept.pop_front() else { break };
+            self.bytes -= oldest.len();
+            self.first += 1;
+        }
+    }
+
+    /// Records from number `from` on, as many as a message holds; how many before them are gone; the number after the last.
+    fn from(&self, from: u64) -> Option<(Vec<Arc<str>>, u64, u64)> {
+        let skipped = self.first.saturating_sub(from);
+        let begin = usize::try_from(from.saturating_sub(self.first)).ok()?;
+        let mut bytes = 0;
+        let fits = |record: &&Arc<str>| {
+            bytes += record.len();
+            bytes <= MAX_BATCH_BYTES
+        };
+        let batch: Vec<_> = self.kept.iter().skip(begin).take_while(fits).cloned().collect();
+        let next = from + skipped + batch.len() as u64;
+        (!batch.is_empty()).then_some((batch, skipped, next))
+    }
+}
+
+/// Text that is JSON of this form, and what it says.
+fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str, T), String> {
+    if json.len() > MAX_JSON_BYTES {
+        return Err(format!("JSON of {} bytes; accepted: {MAX_JSON_BYTES}", json.len()));
+    }
+    let fault = |error: &dyn std::fmt::Display| format!("a message that is not understood: {error}");
+    let text = std::str::from_utf8(json).map_err(|error| fault(&error))?;
+    Ok((text, serde_json::from_str(text).map_err(|error| fault(&error))?))
+}
+
+/// A message to the page: the length of the JSON as a little-endian u32, the JSON, and a picture.
+fn message(json: &str, picture: &[u8]) -> Bytes {
+    // Our own JSON is shorter than 2^32.
+    let length = u32::try_from(json.len()).unwrap_or(u32::MAX);
+    [&length.to_le_bytes(), json.as_bytes(), picture].concat().into()
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,138 @@
+//! The dashboard: a web page that shows the published frames.
+//!
+//! In: the messages of a publisher, over ZeroMQ. Out: one page and a WebSocket, over HTTP. Calls `publish` for the names of messages, and the
+//! crate `ridgewatch-zmtp`.
+//!
+//! One thread does all of it. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
+//! that none waits for another one and no queue grows behind it.
+
+mod access;
+mod client;
+mod error;
+mod files;
+mod hub;
+mod server;
+mod token;
+
+pub use error::DashboardError;
+pub use token::Token;
+
+use access::Access;
+use hub::Hub;
+use ridgewatch_zmtp::{check_endpoint, private_endpoint};
+use std::io::ErrorKind;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+use tokio::sync::oneshot;
+
+/// Port that is taken if it is free.
+pub const DEFAULT_PORT: u16 = 8577;
+/// Longest wait at the end for tasks of the runtime.
+const SHUTDOWN_LIMIT: Duration = Duration::from_millis(200);
+
+/// What a dashboard shows, and to whom.
+#[derive(Debug)]
+pub struct DashboardSettings {
+    /// ZeroMQ endpoint of the publisher: `tcp://HOST:PORT`, `ipc://PATH`, or `private`.
+    pub endpoint: String,
+    /// Address to listen at.
+    pub address: IpAddr,
+    /// Port to listen at, 0 for any free one. `None`: [`DEFAULT_PORT`], or any free one if it is taken.
+    pub port: Option<u16>,
+    /// Names, besides those of this machine's loopback, by which browsers reach it through a proxy.
+    pub hosts: Vec<String>,
+    /// What a browser must know.
+    pub token: Token,
+}
+
+impl DashboardSettings {
+    /// Serves this machine only, with these frames.
+    pub fn local(endpoint: String, port: Option<u16>, token: Token) -> Self {
+        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token }
+    }
+}
+
+/// A server that runs until it is dropped.
+#[derive(Debug)]
+pub struct Dashboard {
+    address: SocketAddr,
+    endpoint: String,
+    token: Token,
+    /// Dropped to end the thread.
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Dashboard {
+    /// Listens, and begins to follow the publisher, which need not exist yet.
+    ///
+    /// # Errors
+    /// An endpoint or a name of a host that is not accepted, a port in use, or an error of the system.
+    pub fn start(settings: DashboardSettings) -> Result<Self, DashboardError> {
+        let DashboardSettings { endpoint, address, port, hosts, token } = settings;
+        let endpoint = match endpoint.as_str() {
+            crate::publish::DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|source| DashboardError::Private { source })?,
+            _ => endpoint,
+        };
+        check_endpoint(&endpoint).map_err(|problem| DashboardError::Endpoint { endpoint: endpoint.clone(), problem })?;
+        let listener = listen(address, port)?;
+        let address = listener.local_addr()?;
+        let access = Access::new(token.clone(), hosts, address)?;
+        let hub = Arc::new(Hub::new(endpoint.clone()));
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
+        let listener = {
+            let _inside = runtime.enter();
+            tokio::net::TcpListener::from_std(listener)?
+        };
+        let (stop, stopped) = oneshot::channel();
+        let thread = std::thread::Builder::new().name("ridgewatch-dashboard".to_owned()).spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    // Its sender is dropped.
+                    _ = stopped => {}
+                    () = hub.follow() => {}
+                    () = server::serve(listener, access, Arc::clone(&hub)) => {}
+                }
+            });
+            runtime.shutdown_timeout(SHUTDOWN_LIMIT);
+        })?;
+        Ok(Self { address, endpoint, token, stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Address of the page, without the token.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Endpoint of the publisher.
+    pub fn endpoint(&self) -> &str {
+        &self.endpoint
+    }
+
+    /// Address of the page with the token: whoever knows it sees the frames.
+    pub fn url(&self) -> String {
+        format!("http://{}/?token={}", self.address, self.token.secret())
+    }
+}
+
+impl Drop for Dashboard {
+    fn drop(&mut self) {
+        self.stop.take();
+        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+            tracing::error!("the dashboard's thread ended by a panic");
+        }
+    }
+}
+
+fn listen(address: IpAddr, port: Option<u16>) -> Result<TcpListener, DashboardError> {
+    let wanted = SocketAddr::new(address, port.unwrap_or(DEFAULT_PORT));
+    let listener = match TcpListener::bind(wanted) {
+        Err(error) if port.is_none() && error.kind() == ErrorKind::AddrInUse => TcpListener::bind((address, 0)),
+        bound => bound,
+    };
+    let listener = listener.map_err(|source| DashboardError::Listen { address: wanted, source })?;
+    listener.set_nonblocking(true)?;
+    Ok(listener)
+}

@@ -1,0 +1,129 @@
+//! HTTP: the page, its files, and the WebSocket.
+
+use super::access::{Access, Refused};
+use super::hub::Hub;
+use super::{client, files};
+use axum::body::Body;
+use axum::extract::{FromRequestParts, Request, WebSocketUpgrade};
+use axum::http::header::{
+    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, REFERRER_POLICY, SET_COOKIE,
+    X_CONTENT_TYPE_OPTIONS,
+};
+use axum::http::{Method, StatusCode};
+use axum::response::{IntoResponse, Response};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::time::timeout;
+
+/// Maximum number of HTTP connections. Those of open pages, which are WebSockets by then, are counted elsewhere.
+const MAX_CONNECTIONS: usize = 128;
+/// Time for the head of a request.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time after which an HTTP connection ends, also of a browser that does not read. A browser opens the next one by itself.
+const CONNECTION_TIMEOUT: Duration = Duration::from_secs(60);
+/// Maximum length of the head of a request, in bytes, and number of its fields.
+const MAX_HEAD_BYTES: usize = 16 << 10;
+const MAX_HEAD_FIELDS: usize = 64;
+/// Maximum length of what a page says, in bytes.
+const MAX_SAID_BYTES: usize = 1024;
+/// Pause after a connection could not be accepted, because no descriptor is free for instance.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// Scripts, styles and connections of this server alone; `ws:` since some browsers do not count a WebSocket as `'self'`.
+const POLICY: &str = "default-src 'self'; img-src 'self' blob:; connect-src 'self' ws: wss:; style-src 'self'; base-uri 'none'; \
+     form-action 'none'; frame-ancestors 'self'";
+/// In every answer.
+const HEADERS: [(HeaderName, HeaderValue); 4] = [
+    (CACHE_CONTROL, HeaderValue::from_static("no-store")),
+    (CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY)),
+    (REFERRER_POLICY, HeaderValue::from_static("no-referrer")),
+    (X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
+];
+
+/// Serves browsers. Never ends.
+pub(super) async fn serve(listener: TcpListener, access: Access, hub: Arc<Hub>) {
+    let (access, places) = (Arc::new(access), Arc::new(Semaphore::new(MAX_CONNECTIONS)));
+    loop {
+        let Ok((stream, _)) = listener.accept().await else {
+            tokio::time::sleep(PAUSE).await;
+            continue;
+        };
+        // Without a place the connection is closed.
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+        let (access, hub) = (Arc::clone(&access), Arc::clone(&hub));
+        tokio::spawn(async move {
+            let _ = timeout(CONNECTION_TIMEOUT, connection(stream, access, hub)).await;
+            drop(place);
+        });
+    }
+}
+
+/// Answers the requests of a connection, until it ends or becomes a WebSocket.
+async fn connection(stream: TcpStream, access: Arc<Access>, hub: Arc<Hub>) {
+    // Small messages follow large ones.
+    let _ = stream.set_nodelay(true);
+    let service = service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
+        let (access, hub) = (Arc::clone(&access), Arc::clone(&hub));
+        async move { Ok::<_, Infallible>(answer(request.map(Body::new), &access, hub).await) }
+    });
+    let served = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEAD_TIMEOUT)
+        .max_buf_size(MAX_HEAD_BYTES)
+        .max_headers(MAX_HEAD_FIELDS)
+        .serve_connection(TokioIo::new(stream), service)
+        .with_upgrades()
+        .await;
+    if let Err(error) = served {
+        // Without the request, whose path holds the token.
+        tracing::debug!("a connection of the dashboard ended: {error}");
+    }
+}
+
+async fn answer(request: Request, access: &Access, hub: Arc<Hub>) -> Response {
+    let mut response = match respond(request, access, hub).await {
+        Ok(response) => response,
+        Err(refused) => (StatusCode::FORBIDDEN, refused).into_response(),
+    };
+    response.headers_mut().extend(HEADERS);
+    response
+}
+
+/// Answers by the end of the path, since some proxies put a prefix before it.
+async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Response, Refused> {
+    let (mut parts, _) = request.into_parts();
+    access.check_host(&parts.headers)?;
+    if parts.method != Method::GET && parts.method != Method::HEAD {
+        return Ok((StatusCode::METHOD_NOT_ALLOWED, [(ALLOW, "GET, HEAD")]).into_response());
+    }
+    let path = parts.uri.path();
+    if path.ends_with('/') {
+        access.check_token(&parts.uri, &parts.headers)?;
+        let cookie = HeaderValue::from_str(&access.cookie()).map_err(|_| "The token cannot be a cookie.\n")?;
+        return Ok((HeaderMap::from_iter([(SET_COOKIE, cookie)]), file(files::PAGE)).into_response());
+    }
+    if path.ends_with("/socket") {
+        access.check_origin(&parts.headers)?;
+        access.check_token(&parts.uri, &parts.headers)?;
+        return Ok(match WebSocketUpgrade::from_request_parts(&mut parts, &()).await {
+            Ok(upgrade) => {
+                upgrade.max_message_size(MAX_SAID_BYTES).max_frame_size(MAX_SAID_BYTES).on_upgrade(move |socket| client::serve(socket, hub))
+            }
+            Err(rejection) => rejection.into_response(),
+        });
+    }
+    Ok(match files::named(path) {
+        Some(found) => file(found).into_response(),
+        None => (StatusCode::NOT_FOUND, "There is no such file.\n").into_response(),
+    })
+}
+
+fn file(file: files::File) -> impl IntoResponse {
+    ([(CONTENT_TYPE, file.media_type)], file.bytes)
+}
