@@ -5,6 +5,7 @@ use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, DeviceChoice};
 use ridgewatch::chart::{Choice, choose, device_name};
 use ridgewatch::config::{ConfigError, SceneFile};
+use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
 use ridgewatch::run::{RunError, Setup};
@@ -59,7 +60,8 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
         let run = cause.downcast_ref().is_some_and(|error: &RunError| error.refused().is_some());
         let publish = cause.downcast_ref().is_some_and(|error: &PublishError| error.refused().is_some());
         let source = cause.downcast_ref().is_some_and(|error: &SourceError| error.refused().is_some());
-        run || publish || source || cause.is::<ConfigError>() || cause.is::<Usage>()
+        let dashboard = cause.downcast_ref().is_some_and(DashboardError::is_usage);
+        run || publish || dashboard || source || cause.is::<ConfigError>() || cause.is::<Usage>()
     });
     if configuration { 2 } else { 1 }
 }

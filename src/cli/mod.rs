@@ -5,6 +5,7 @@ mod chart;
 mod clean;
 mod common;
 mod compare;
+mod dashboard;
 mod doctor;
 mod ftle;
 mod inspect;
@@ -43,6 +44,8 @@ enum Command {
     Replay(replay::Options),
     /// Run beside a simulation: wait for it, follow it, and continue after its restart.
     Attach(attach::Options),
+    /// Show the published frames on a web page, on this machine only.
+    Dashboard(dashboard::Options),
     /// Publish an archive into a ring, as a simulation does.
     Publish(publish::Options),
     /// Send the rings of this node to ridgewatch on another node.
@@ -91,6 +94,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
         Command::Attach(options) => attach::run(&common, options),
+        Command::Dashboard(options) => dashboard::run(&common, options),
         Command::Publish(options) => publish::run(&common, options),
         Command::Relay(options) => relay::run(&common, options),
         Command::Clean(options) => clean::run(&common, &options),

@@ -4,10 +4,10 @@ use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
 };
 use super::signals::Stop;
-use super::{messages, notify};
+use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, PublishSettings, RunFolder, Summary};
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
 use std::path::PathBuf;
@@ -33,6 +33,10 @@ pub struct RunArguments {
     /// Publish frames at this ZeroMQ endpoint (port 0: any free one, which is printed); by default they go to files only.
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
     publish: Option<String>,
+    /// Show the run on a web page, on this machine only, at this port or any free one; prints its address. Frames are published for it at the
+    /// endpoint of --publish, or else where only this user reaches them.
+    #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
+    dashboard: Option<Option<u16>>,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
@@ -127,8 +131,9 @@ impl Session<'_> {
             watch();
         }
         // The socket first: a port in use must not cost the previous run in the folder.
-        let publish = scene.publish_settings();
-        let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
+        let mut publish = scene.publish_settings();
+        let started = if options.dashboard.is_some() { start_shown(&mut publish) } else { Output::start(&publish, None) };
+        let mut output = started.map_err(|error| located(&scene, error, PublishError::refused))?;
         let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
         if out != options.out {
@@ -142,6 +147,8 @@ impl Session<'_> {
         if let Some(endpoint) = output.endpoint() {
             messages::note(format_args!("publishing at {endpoint}"));
         }
+        let shown = options.dashboard.zip(output.endpoint());
+        let _dashboard = shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port));
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,
@@ -179,6 +186,22 @@ impl Session<'_> {
             (true, false) => Err(Interrupted { status: stop.status(), done: DONE }.into()),
         }
     }
+}
+
+/// Starts the output of a run with a dashboard. An endpoint that is wanted for the dashboard alone costs no run: another `ridgewatch` may publish
+/// at the private one.
+fn start_shown(publish: &mut PublishSettings) -> Result<Output, PublishError> {
+    if publish.endpoint.is_none() {
+        for endpoint in [DEFAULT_ENDPOINT, "tcp://127.0.0.1:0"] {
+            publish.endpoint = Some(endpoint.to_owned());
+            match Output::start(publish, None) {
+                Ok(output) => return Ok(output),
+                Err(error) => messages::note(format_args!("no frames for the dashboard: {error}")),
+            }
+        }
+        publish.endpoint = None;
+    }
+    Output::start(publish, None)
 }
 
 /// Runs the cycle on the calling thread. Whatever happens, completes the output of the frames made so far.

@@ -1,0 +1,97 @@
+//! `ridgewatch dashboard`, and the dashboard beside a run.
+
+use super::common::{Common, Usage, print_json, print_text};
+use super::{messages, signals};
+use anyhow::{Result, bail};
+use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
+use ridgewatch::publish::DEFAULT_ENDPOINT;
+use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+/// Interval between looks at the flag to stop.
+const GLANCE: Duration = Duration::from_millis(50);
+
+/// Options of `dashboard`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// Where frames are published (`--publish`): private, ipc://PATH or tcp://HOST:PORT.
+    #[arg(value_name = "ENDPOINT", default_value = DEFAULT_ENDPOINT)]
+    endpoint: String,
+    /// Port of the page; 0: any free one. By default 8577, or any free one if that is taken.
+    #[arg(long, value_name = "PORT")]
+    port: Option<u16>,
+    /// Address to listen at. Others than 127.0.0.1 let other machines reach the page, without encryption.
+    #[arg(long, value_name = "ADDRESS", default_value_t = Ipv4Addr::LOCALHOST.into())]
+    bind: IpAddr,
+    /// Name by which browsers reach the page through a proxy, as in their address bar; may be repeated.
+    #[arg(long, value_name = "NAME")]
+    allow_host: Vec<String>,
+    /// Keep the token in this file (mode 0600), which is made if it does not exist, and print the address without it.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+/// Serves the page until a signal comes.
+pub fn run(common: &Common, options: Options) -> Result<()> {
+    if !common.overrides.is_empty() {
+        bail!(Usage("--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file".into()));
+    }
+    let Options { endpoint, port, bind: address, allow_host: hosts, token_file } = options;
+    let token = token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token })?;
+    if !address.is_loopback() {
+        messages::note(format_args!(
+            "{} is open to other machines: without encryption, whoever reads the network sees frames and token",
+            dashboard.address()
+        ));
+    }
+    signals::until_stopped(
+        || (),
+        |stop| {
+            messages::note(format_args!("frames from {}", dashboard.endpoint()));
+            announce(&dashboard, common.json, token_file.is_some())?;
+            while !stop.load(Ordering::Relaxed) {
+                std::thread::sleep(GLANCE);
+            }
+            Ok(())
+        },
+    )
+}
+
+/// Starts a dashboard beside a run that publishes at `endpoint`. Without one the run goes on.
+pub fn beside(common: &Common, endpoint: &str, port: Option<u16>) -> Option<Dashboard> {
+    let started =
+        Token::random().map_err(Into::into).and_then(|token| Dashboard::start(DashboardSettings::local(endpoint.to_owned(), port, token)));
+    match started {
+        Ok(dashboard) => {
+            if let Err(error) = announce(&dashboard, common.json, false) {
+                messages::note(format_args!("the address of the dashboard cannot be printed: {error}"));
+            }
+            Some(dashboard)
+        }
+        Err(error) => {
+            messages::note(format_args!("there is no dashboard: {error}"));
+            None
+        }
+    }
+}
+
+/// Prints the address on standard output, since standard error often goes to a log that others may read.
+fn announce(dashboard: &Dashboard, json: bool, keeps_token: bool) -> Result<()> {
+    let address = dashboard.address();
+    let url = if keeps_token { format!("http://{address}/") } else { dashboard.url() };
+    if json {
+        return print_json(&serde_json::json!({ "url": url }));
+    }
+    let token = if keeps_token { "?token= and the text of the token file" } else { "" };
+    print_text(format_args!("dashboard: {url}{token}"));
+    if address.ip().is_loopback() {
+        let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+        let (port, host) = (address.port(), host.trim());
+        let host = if host.is_empty() { "HOST" } else { host };
+        print_text(format_args!("from another machine: ssh -L {port}:{address} {host}, then the same address there"));
+    }
+    Ok(())
+}
