@@ -121,6 +121,11 @@ impl Running {
         self.output.as_ref().unwrap()[1].so_far()
     }
 
+    /// Standard output up to now.
+    pub fn stdout(&self) -> String {
+        self.output.as_ref().unwrap()[0].so_far()
+    }
+
     pub fn signal(&self, signal: i32) {
         // SAFETY: a signal to a child of this test.
         assert_eq!(unsafe { libc::kill(self.id() as i32, signal) }, 0);
