@@ -38,7 +38,6 @@ export class Connection {
     const socket = new WebSocket(socketAddress(this.token));
     this.socket = socket;
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => { this.status = "open"; this.retryAt = null; this.heard = performance.now(); this.opened(); };
     socket.onmessage = (event) => this.receive(socket, event.data);
     socket.onclose = ({ code }) => (code === DISPLACED ? this.stop() : this.lose());
   }
@@ -46,9 +45,16 @@ export class Connection {
   receive(socket, data) {
     this.heard = performance.now();
     this.delay = FIRST_DELAY;
+    // Not when the socket opens: some proxies accept before they ask the server.
+    if (this.status !== "open") this.admit();
     let message;
     try { message = parseMessage(data); } catch (error) { this.broken(error); return; }
     this.message(message, (sequence) => acknowledge(socket, sequence));
+  }
+
+  admit() {
+    this.status = "open";
+    this.opened();
   }
 
   check() {
@@ -59,7 +65,7 @@ export class Connection {
   lose() {
     const neverOpened = this.status !== "open";
     const socket = this.socket;
-    socket.onopen = socket.onmessage = socket.onclose = null;
+    socket.onmessage = socket.onclose = null;
     socket.close();
     if (this.status !== "refused") this.status = "lost";
     const wait = this.delay * (0.75 + 0.5 * Math.random());

@@ -6,7 +6,6 @@ import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import http from "node:http";
 import { tmpdir } from "node:os";
 import path from "node:path";
-import { createInterface } from "node:readline";
 import { WebSocket, WebSocketServer } from "ws";
 
 export const REPOSITORY = path.resolve(import.meta.dirname, "../../..");
@@ -21,7 +20,9 @@ export const MESSAGE_LIMIT = 10_000_000;
 export const TOKEN = "a-token-of-the-tests-0123456789abcdef";
 
 // Small pictures, several a second, so that silence is noticed within its shortest limit.
-const SMALL = { "render.width": 160, "render.height": 80, "render.samples": 1, "time.slides": 5000 };
+const SMALL = {
+  "render.width": 96, "render.height": 48, "render.samples": 1, "render.budget": 50, "time.slides": 5000, "publish.exr": '"none"', "publish.preview": false,
+};
 
 export function launch() {
   return chromium.launch({ executablePath: CHROMIUM, args: FLAGS });
@@ -35,6 +36,8 @@ export function temporary() {
 }
 
 const children = new Set();
+// A run that takes too long is ended by a signal.
+process.once("SIGTERM", () => process.exit(1));
 process.on("exit", () => { for (const child of children) child.kill("SIGKILL"); });
 
 function start(args) {
@@ -52,23 +55,26 @@ export async function stop(child, signal = "SIGTERM") {
   await once(child, "exit");
 }
 
-export function startPublisher(endpoint) {
+export function startPublisher(endpoint, folder) {
   const settings = Object.entries(SMALL).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
-  const child = start(["replay", "configs/double_gyre.toml", "--device", "cpu", "--publish", endpoint, ...settings]);
+  const child = start(["replay", "configs/double_gyre.toml", "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings]);
   child.stdout.resume();
+  child.once("exit", (code) => { if (code) console.error(`the publisher ended: ${child.log}`); });
   return child;
 }
 
 /** The server, and the port of its page. */
-export async function startDashboard(endpoint, folder, port = 0) {
+export async function startDashboard(endpoint, folder, port = 0, token = TOKEN) {
   const file = path.join(folder, "token");
-  writeFileSync(file, `${TOKEN}\n`, { mode: 0o600 });
+  writeFileSync(file, `${token}\n`, { mode: 0o600 });
   const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json"]);
-  for await (const line of createInterface(child.stdout)) {
-    child.stdout.resume();
-    return { child, port: Number(new URL(JSON.parse(line).url).port) };
-  }
-  throw new Error(`the dashboard did not start: ${child.log}`);
+  let text = "";
+  child.stdout.on("data", (part) => { text += part; });
+  const url = await until("the dashboard prints its address", () => {
+    if (child.exitCode !== null) throw new Error(`the dashboard did not start: ${child.log}`);
+    return /"url":\s*"([^"]+)"/.exec(text)?.[1];
+  });
+  return { child, port: Number(new URL(url).port) };
 }
 
 /**
