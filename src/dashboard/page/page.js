@@ -42,9 +42,11 @@ function unseen(list) {
 
 function receiveRecords(list) {
   const fresh = unseen(list.filter((record) => Number.isFinite(record?.frame)));
+  // What a server tells first is the past.
+  const watched = newest !== null;
   for (const record of fresh) {
     const missing = records.missing;
-    if (records.add(rowOf(record))) beginRun(record.frame);
+    if (records.add(rowOf(record))) beginRun(record.frame, watched);
     else if (records.missing > missing) warnings.hold("gaps", `${count(records.missing - missing)} records did not arrive`, record.frame);
     newest = record;
   }
@@ -52,10 +54,10 @@ function receiveRecords(list) {
   chartsDue ||= fresh.length > 0;
 }
 
-function beginRun(frame) {
+function beginRun(frame, watched) {
   warnings.forget();
   tolerance = null;
-  warnings.hold("new", "A new run began", frame);
+  warnings.hold("new", "A new run began", frame, watched);
 }
 
 async function receiveFrame({ sequence, header, payload }, reply) {

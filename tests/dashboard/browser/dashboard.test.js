@@ -267,6 +267,36 @@ test("a publisher that is killed is noticed within 5 s, and its successor follow
   assert.deepEqual(complaints, []);
 });
 
+test("a connection that drops comes back, and nothing is told twice", async () => {
+  await following();
+  const [before, told] = [await position(), await page.textContent("#log")];
+  for (const upstream of proxy.upstreams) upstream.terminate();
+  await until("the loss is said", async () => /^Not connected/.test(await state()));
+  await following();
+  await advance(before + 3);
+  assert.equal(await page.textContent("#log"), told);
+  await advance((await position()) + 2);
+  const frames = await page.textContent(".chart .u-legend .u-series:first-child .u-value");
+  assert.ok(Number(frames) > before);
+});
+
+test("a connection that is open in name only is noticed", async () => {
+  await following();
+  proxy.mute = true;
+  await until("the loss is said", async () => /^Not connected/.test(await state()), 9_000);
+  proxy.mute = false;
+  await following();
+});
+
+test("a page that had to make room says so and does not come back by itself", async () => {
+  await following();
+  for (const client of proxy.sockets.clients) client.close(4001);
+  await until("it is said", async () => /Too many pages are open/.test(await warning()));
+  await page.waitForTimeout(2_000);
+  assert.match(await state(), /^Not connected/);
+  assert.equal(proxy.sockets.clients.size, 0);
+});
+
 test("a server that is killed is noticed, and its successor followed", async () => {
   await following();
   await stop(dashboard.child, "SIGKILL");

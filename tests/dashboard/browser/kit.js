@@ -79,13 +79,14 @@ export async function startDashboard(endpoint, folder, port = 0, token = TOKEN) 
 
 /**
  * A proxy that puts `prefix` before every path and keeps it, as Open OnDemand's /node/ does, and refuses long messages. `change(message)`, if set, may
- * return other bytes for a message of the server.
+ * return other bytes for a message of the server; while `mute` is set nothing passes.
  */
 export class Proxy {
   constructor(prefix) {
     this.prefix = prefix;
     this.target = 0;
     this.change = null;
+    this.mute = false;
     this.longest = 0;
     this.upstreams = new Set();
     this.server = http.createServer((request, response) => this.pass(request, response));
@@ -119,7 +120,7 @@ export class Proxy {
     this.upstreams.add(upstream);
     upstream.on("message", (data) => {
       this.longest = Math.max(this.longest, data.length);
-      client.send(this.change?.(data) ?? data);
+      if (!this.mute) client.send(this.change?.(data) ?? data);
     });
     client.on("message", (data) => { if (upstream.readyState === WebSocket.OPEN) upstream.send(data.toString()); });
     client.on("close", () => upstream.terminate());
