@@ -101,9 +101,8 @@ function axis(more) {
 }
 
 function axes(spec) {
-  const left = axis({
-    scale: "y", size: 3.6 * rem(), values: (_, splits) => splits.map((value) => (value === null ? "" : spec.share ? percent(value) : number(value))),
-  });
+  const words = spec.share ? percent : (value) => number(value, spec.log ? 1 : 3);
+  const left = axis({ scale: "y", size: 3.6 * rem(), values: (_, splits) => splits.map((value) => (value === null ? "" : words(value))) });
   const right = axis({ scale: "time", side: 1, size: 3.6 * rem(), grid: { show: false }, values: (_, splits) => splits.map((value) => number(value, 5)) });
   const bottom = axis({ size: 1.8 * rem(), space: 4 * rem(), incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6] });
   return [bottom, left, ...(spec.series.some((series) => series.scale) ? [right] : [])];
@@ -203,9 +202,9 @@ export class Charts {
     ctx.restore();
   }
 
-  /** Draws the rows. A tolerance that the frames state goes through all of them. */
-  update(rows, tolerance) {
-    this.rows = tolerance == null ? rows.slice() : rows.map((row) => ({ ...row, tolerance }));
+  /** Draws the rows. */
+  update(rows) {
+    this.rows = rows.slice();
     for (const spec of CHARTS) this.updateOne(spec);
   }
 

@@ -26,7 +26,6 @@ let connection;
 let newest = null;
 let server = null;
 let heard = null;
-let tolerance = null;
 let chartsDue = false;
 let logVersion = -1;
 let announced = { kind: null, at: 0 };
@@ -56,14 +55,12 @@ function receiveRecords(list) {
 
 function beginRun(frame, watched) {
   warnings.forget();
-  tolerance = null;
   warnings.hold("new", "A new run began", frame, watched);
 }
 
 async function receiveFrame({ sequence, header, payload }, reply) {
   try {
     await picture.receive(header, payload);
-    if (Number.isFinite(header.tolerance)) tolerance = header.tolerance;
   } catch (error) {
     warnings.hold("picture", `The picture of frame ${count(header?.frame)} was skipped: ${error.message}`, header?.frame ?? null);
   }
@@ -201,7 +198,7 @@ function refresh() {
   if (!chartsDue || document.hidden) return;
   chartsDue = false;
   element("no-charts").hidden = true;
-  charts.update(records.rows, tolerance);
+  charts.update(records.rows);
 }
 
 // Controls
