@@ -165,12 +165,15 @@ impl Hub {
         loop {
             let begin = tokio::time::Instant::now();
             match Subscriber::connect(&self.endpoint, &[FRAME_TOPIC, RECORD_TOPIC], MAX_MESSAGE_BYTES).await {
-                Ok(mut subscriber) => loop {
-                    match subscriber.receive().await {
-                        Ok(parts) => self.take(&parts),
-                        Err(error) => break self.lost(&error),
+                Ok(mut subscriber) => {
+                    lock(&self.health).problem = None;
+                    loop {
+                        match subscriber.receive().await {
+                            Ok(parts) => self.take(&parts),
+                            Err(error) => break self.lost(&error),
+                        }
                     }
-                },
+                }
                 Err(error) => self.lost(&error),
             }
             tokio::time::sleep_until(begin + RECONNECT).await;
@@ -196,9 +199,8 @@ impl Hub {
         };
         let mut health = lock(&self.health);
         health.last_message = Some(Instant::now());
-        match taken {
-            Ok(()) => health.problem = None,
-            Err(problem) => health.problem = Some(problem),
+        if let Err(problem) = taken {
+            health.problem = Some(problem);
         }
     }
 
@@ -207,9 +209,14 @@ impl Hub {
         struct Numbered {
             #[serde(rename = "frame")]
             _frame: u64,
+            seconds: Option<Seconds>,
         }
-        let (record, Numbered { .. }) = checked(json)?;
-        lock(&self.health).note_record(Instant::now());
+        #[derive(Deserialize)]
+        struct Seconds {
+            total: Option<f64>,
+        }
+        let (record, Numbered { seconds, .. }) = checked(json)?;
+        lock(&self.health).note_record(Instant::now(), seconds.and_then(|seconds| seconds.total));
         lock(&self.records).keep(record.into());
         self.recorded.send_modify(|count| *count += 1);
         Ok(())
@@ -236,6 +243,8 @@ impl Hub {
             let json = format!(r#"{{"kind":"frame","sequence":{sequence},"header":{header}}}"#);
             *newest = Some(Arc::new(Picture { sequence, message: message(&json, picture) }));
         });
+        // Records arrive also where pictures are not understood.
+        lock(&self.health).problem = None;
         Ok(())
     }
 
@@ -265,13 +274,14 @@ impl Hub {
 }
 
 impl Health {
-    fn note_record(&mut self, now: Instant) {
-        if let Some(before) = self.last_record.replace(now) {
-            if self.intervals.len() == INTERVALS {
-                self.intervals.pop_front();
-            }
-            self.intervals.push_back(now - before);
+    /// Before the first interval, the frame's own `seconds` stand for it.
+    fn note_record(&mut self, now: Instant, seconds: Option<f64>) {
+        let own = || Duration::try_from_secs_f64(seconds.unwrap_or_default()).unwrap_or_default();
+        let interval = self.last_record.replace(now).map_or_else(own, |before| now - before);
+        if self.intervals.len() == INTERVALS {
+            self.intervals.pop_front();
         }
+        self.intervals.push_back(interval);
     }
 
     fn status(&self, silence: Option<Duration>) -> Status {
@@ -328,4 +338,30 @@ fn message(json: &str, picture: &[u8]) -> Bytes {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_publisher_is_silent_after_five_of_its_intervals() {
+        let seconds = Duration::from_secs_f64;
+        let mut health = Health::default();
+        assert_eq!(health.status(None), Status::Waiting);
+        let begin = Instant::now();
+        health.note_record(begin, Some(2.0));
+        assert_eq!(health.status(Some(seconds(9.9))), Status::Following, "a frame takes two seconds");
+        assert_eq!(health.status(Some(seconds(10.1))), Status::Silent);
+        // Fast frames, one pause: the median is not moved by it.
+        for number in 1..20 {
+            let pause = if number > 15 { 60.0 } else { 0.0 };
+            health.note_record(begin + seconds(0.1 * f64::from(number) + pause), None);
+        }
+        assert_eq!(health.status(Some(seconds(2.9))), Status::Following);
+        assert_eq!(health.status(Some(seconds(3.1))), Status::Silent);
+        for odd in [f64::NAN, -1.0, f64::MAX] {
+            Health::default().note_record(begin, Some(odd));
+        }
+    }
 }

@@ -316,6 +316,8 @@ fn messages_that_are_not_understood_are_told_and_cost_nothing() {
         publisher.send(&parts, b"abc".to_vec(), Keep::All);
         let state = visitor.until_state(|state| state["problem"].as_str().is_some_and(|problem| problem.contains(hint)));
         assert!(state["status"] == "following", "{state}");
+        publisher.send(&[b"record"], br#"{"frame":1}"#.to_vec(), Keep::All);
+        assert!(visitor.until_state(|_| true)["problem"].is_string(), "a record does not hide it");
         publisher.send(&[b"frame", &good], b"abc".to_vec(), Keep::All);
         assert_eq!(visitor.frame().payload, b"abc");
         visitor.until_state(|state| state["problem"].is_null());
@@ -356,7 +358,8 @@ fn a_head_that_never_ends_is_not_waited_for() {
     slow.set_read_timeout(Some(LIMIT)).unwrap();
     slow.write_all(b"GET / HTTP/1.1\r\nHost: ").unwrap();
     slow.read_to_end(&mut Vec::new()).unwrap();
-    assert!(begin.elapsed() > Duration::from_secs(5), "the limit is not that of another fault");
+    // 10 seconds, and time for a busy machine.
+    assert!((8.0..25.0).contains(&begin.elapsed().as_secs_f64()), "{:?}", begin.elapsed());
     let long = format!("GET / HTTP/1.1\r\nHost: {}\r\nX-Long: {}\r\n\r\n", stage.address(), "a".repeat(20 << 10));
     assert_eq!(ask(stage.address(), &long).0, 431);
 }
