@@ -1,17 +1,13 @@
 //! `ridgewatch dashboard`, and the dashboard beside a run.
 
 use super::common::{Common, Usage, print_json, print_text};
-use super::{messages, signals};
+use super::messages;
 use anyhow::{Result, bail};
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
 use ridgewatch::publish::DEFAULT_ENDPOINT;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
-use std::time::Duration;
-
-/// Interval between looks at the flag to stop.
-const GLANCE: Duration = Duration::from_millis(50);
+use tokio::signal::unix::{SignalKind, signal};
 
 /// Options of `dashboard`.
 #[derive(Debug, clap::Args)]
@@ -22,7 +18,8 @@ pub struct Options {
     /// Port of the page; 0: any free one. By default 8577, or any free one if that is taken.
     #[arg(long, value_name = "PORT")]
     port: Option<u16>,
-    /// Address to listen at. Others than 127.0.0.1 let other machines reach the page, without encryption.
+    /// Address to listen at. Others than 127.0.0.1 let other machines reach the page, by this address or a name of --allow-host, without
+    /// encryption.
     #[arg(long, value_name = "ADDRESS", default_value_t = Ipv4Addr::LOCALHOST.into())]
     bind: IpAddr,
     /// Name by which browsers reach the page through a proxy, as in their address bar; may be repeated.
@@ -47,17 +44,18 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             dashboard.address()
         ));
     }
-    signals::until_stopped(
-        || (),
-        |stop| {
-            messages::note(format_args!("frames from {}", dashboard.endpoint()));
-            announce(&dashboard, common.json, token_file.is_some())?;
-            while !stop.load(Ordering::Relaxed) {
-                std::thread::sleep(GLANCE);
-            }
-            Ok(())
-        },
-    )
+    messages::note(format_args!("frames from {}", dashboard.endpoint()));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        // SIGHUP keeps its meaning: under `nohup` it is ignored.
+        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        announce(&dashboard, common.json, token_file.is_some())?;
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+        Ok(())
+    })
 }
 
 /// Starts a dashboard beside a run that publishes at `endpoint`. Without one the run goes on.
