@@ -2,6 +2,7 @@
 # make test            runs the whole suite and compiles the GPU kernels (NVRTC is fetched into target/); tests of real archives run if the archives are present
 # make test-data       runs only the tests of real archives; RIDGEWATCH_DATA=folder names the folder of the archives
 # make test-reader     tests the NumPy reader of networks
+# make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
 # make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
 #                      with root also from another user, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
@@ -38,6 +39,8 @@ FUZZ_TARGETS := ring message netcdf checkpoint scene
 FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
+DASHBOARD_TESTS := tests/dashboard/browser
+
 # Folder of the real archives that tests/archive/real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
@@ -48,7 +51,7 @@ PREFIX ?= /usr/local
 SONAME := libridgewatch_adapter.so.$(shell sed -n 's/^.define RW_VERSION //p' adapters/c/include/ridgewatch.h)
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-dashboard test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -106,6 +109,17 @@ test-data: packages .venv/installed
 
 test-reader: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test network_reader -- --ignored
+
+# The dashboard's page in Debian's Chromium, with Node's test runner.
+test-dashboard: packages
+	$(CARGO) build --release --bin ridgewatch
+	@command -v chromium >/dev/null || { command -v apt-get >/dev/null && $(SUDO) apt-get update -qq && \
+	  $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium >/dev/null || true; }
+	@if ! command -v chromium >/dev/null; then echo "NOT RUN: the tests of the dashboard's page, since chromium is not installed"; \
+	elif ! node -e 'const [a, b] = process.versions.node.split("."); process.exit(a > 20 || (a == 20 && b >= 19) ? 0 : 1)' 2>/dev/null; then \
+	  echo "NOT RUN: the tests of the dashboard's page, since Node.js 20.19 or newer is not installed"; \
+	elif ! npm --prefix $(DASHBOARD_TESTS) ci --silent --no-audit --no-fund; then echo "NOT RUN: the tests of the dashboard's page, since npm cannot fetch their packages"; \
+	else cd $(DASHBOARD_TESTS) && CHROMIUM=$$(command -v chromium) RIDGEWATCH=$(CURDIR)/target/release/ridgewatch npm test; fi
 
 test-long: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture

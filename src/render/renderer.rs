@@ -8,7 +8,7 @@ use super::rng::FrameRandom;
 use super::smooth::{CoupledPath, IsMissing, Nodes, Picture, PictureError, Refinement, coupled_paths};
 use super::smooth::{LightGrid, node_spacing};
 use super::space::{SceneBox, length};
-use super::tracking::FrameScene;
+use super::tracking::{FrameScene, PHASE};
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
 use super::{Camera, Light, LogStretch, Scene, Transfer};
 use rayon::prelude::*;
@@ -208,6 +208,30 @@ impl Renderer {
             missing: settings.missing_color.map(|c| c as f32),
             inverse_tau: self.inverse_tau,
         }
+    }
+
+    /// Linear radiance in the middle of the picture if the whole box has one FTLE (1/time): what a colour bar shows. That of the background if the ray
+    /// through the middle misses the box.
+    pub fn uniform_color(&self, ftle: f32) -> [f32; 3] {
+        const SLICES: usize = 256;
+        let background = self.scene.settings.background.map(|c| c as f32);
+        let (eye, toward) = self.camera.ray(0.0, 0.0);
+        let Some((enter, leave)) = self.space.intersect(eye, toward) else { return background };
+        let (extinction, albedo) = (self.transfer.extinction(ftle), self.transfer.albedo(ftle));
+        let slice = (leave - enter) / SLICES as f64;
+        let passed = (-extinction * slice as f32).exp();
+        let (mut color, mut transmittance) = ([0.0; 3], 1.0);
+        for i in 0..SLICES {
+            let along = enter + (i as f64 + 0.5) * slice;
+            let point = std::array::from_fn(|k| eye[k] + along * toward[k]);
+            let (to_light, distance, radiance) = self.light.seen_from(point);
+            let depth =
+                extinction * self.space.exit(self.space.grid_point(point), self.space.grid_direction(to_light)).min(distance as f32);
+            let scattered = transmittance * (1.0 - passed) * PHASE * (-depth).exp();
+            (0..3).for_each(|k| color[k] += scattered * albedo[k] * radiance[k]);
+            transmittance *= passed;
+        }
+        std::array::from_fn(|k| color[k] + transmittance * background[k])
     }
 
     /// Refines a picture by one round of rays and coupled samples, whose traced queries `answers` takes. The film is that of the whole picture.

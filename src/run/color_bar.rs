@@ -1,12 +1,13 @@
-//! The colours of the transfer function, for a colour bar beside the picture.
+//! The colours of a picture by FTLE, for a colour bar beside it.
 
-use crate::render::{Film, Transfer};
+use crate::render::{Film, Renderer};
 use serde::{Deserialize, Serialize};
 
 /// Colours of a bar.
 const COLORS: usize = 32;
 
-/// Colours that the FTLE has under white light of radiance 1, in 8 bits, tone-mapped as the picture is.
+/// Colours in the middle of the picture if the whole box has one FTLE, in 8 bits, tone-mapped as the picture is. Where the FTLE varies, shadow and depth
+/// change them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ColorBar {
     /// R, G, B at FTLE values evenly spaced from `low` to `high`.
@@ -21,14 +22,14 @@ pub struct ColorBar {
 
 impl ColorBar {
     /// Colours between two values of the FTLE. `time_unit` may be empty.
-    pub fn new(transfer: &Transfer, [low, high]: [f64; 2], tone_map: [f64; 3], time_unit: &str) -> Self {
+    pub fn new(renderer: &Renderer, [low, high]: [f64; 2], time_unit: &str) -> Self {
         let at = |i: usize| low + (high - low) * i as f64 / (COLORS - 1) as f64;
-        let colour = |i| {
-            let [r, g, b] = transfer.albedo(at(i) as f32);
+        let color = |i| {
+            let [r, g, b] = renderer.uniform_color(at(i) as f32);
             [r, g, b, 1.0]
         };
-        let film = Film { width: COLORS, height: 1, rgba: (0..COLORS).map(colour).collect(), ..Film::default() };
-        let colors = film.tone_mapped(tone_map).as_chunks().0.to_vec();
+        let film = Film { width: COLORS, height: 1, rgba: (0..COLORS).map(color).collect(), ..Film::default() };
+        let colors = film.tone_mapped(renderer.scene().settings.tone_map).as_chunks().0.to_vec();
         let unit = if time_unit.is_empty() { String::new() } else { format!("1/{time_unit}") };
         Self { colors, low, high, unit }
     }
@@ -37,16 +38,35 @@ impl ColorBar {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::TransferSettings;
+    use crate::field::Domain;
+    use crate::render::{CameraSettings, LightSettings, RenderSettings, Scene, TransferSettings};
 
     #[test]
-    fn the_ends_have_the_albedo_at_low_and_high() {
-        // Red rises with the FTLE, green falls, blue is constant.
+    fn a_box_of_one_ftle_has_its_color_in_closed_form() {
+        // Light from the camera, of radiance 4 pi, on a cube: albedo (1 - exp(-2 depth)) / 2 of the light, and exp(-depth) of the background.
         let albedo = [vec![1.0, -1.0], vec![0.0, 1.0], vec![0.5]];
-        let settings = TransferSettings { low: Some(2.0), high: Some(6.0), extinction: Some(1.0), albedo };
-        let bar = ColorBar::new(&Transfer::new(&settings, 1.0).unwrap(), [2.0, 6.0], [1.0, 0.5, 1.0], "s");
-        assert_eq!((bar.colors[0], bar.colors[COLORS - 1]), ([0, 255, 128], [255, 0, 128]));
-        assert!(bar.colors.is_sorted_by(|a, b| a[0] < b[0] && a[1] > b[1]));
+        let transfer = TransferSettings { low: Some(2.0), high: Some(6.0), extinction: Some(3.0), albedo };
+        let camera = CameraSettings {
+            eye: [0.5, 0.5, 4.0],
+            look_at: [0.5, 0.5, 0.5],
+            up: [0.0, 1.0, 0.0],
+            field_of_view: 40.0,
+            orthographic: false,
+        };
+        let light = LightSettings::directional([0.0, 0.0, -1.0], 4.0 * std::f64::consts::PI);
+        let domain = Domain::cuboid([0.0; 3], [1.0; 3]);
+        let settings = RenderSettings { tone_map: [1.0, 0.5, 1.0], background: [0.25; 3], ..RenderSettings::default() };
+        let scene = Scene::assemble(&domain, Some(camera), Some(light), Some(transfer), settings, 0);
+        let bar = ColorBar::new(&Renderer::new(scene, &domain, 1.0).unwrap(), [2.0, 6.0], "s");
+        for (i, found) in bar.colors.iter().enumerate() {
+            let ramp = i as f64 / (COLORS - 1) as f64;
+            let depth = 3.0 * ramp;
+            // The albedo is a polynomial of 1 - ramp.
+            for (channel, albedo) in [ramp, 1.0 - ramp, 0.5].into_iter().enumerate() {
+                let wanted = albedo * (1.0 - (-2.0 * depth).exp()) / 2.0 + 0.25 * (-depth).exp();
+                assert!((f64::from(found[channel]) - 255.0 * wanted).abs() <= 1.0, "{i}, {channel}: {found:?}, not {wanted}");
+            }
+        }
         assert_eq!((bar.colors.len(), bar.low, bar.high, bar.unit.as_str()), (COLORS, 2.0, 6.0, "1/s"));
     }
 }

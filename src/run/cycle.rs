@@ -365,7 +365,7 @@ impl<'a> Run<'a> {
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
-        let color_bar = Arc::new(ColorBar::new(renderer.transfer(), [range.0, range.1], scene.render.tone_map, &plan.time_unit));
+        let color_bar = Arc::new(ColorBar::new(&renderer, [range.0, range.1], &plan.time_unit));
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
                 let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };

@@ -351,6 +351,7 @@ impl Run<'_> {
             traced: tally.traced,
             missing: tally.missing,
             over_budget: tally.over_budget,
+            tolerance: self.plan.scene.trust.tolerance,
             traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,
             integration_steps: fixed_steps(flow).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,

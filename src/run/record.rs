@@ -52,6 +52,9 @@ pub struct FrameRecord {
     pub over_budget: u64,
     /// `traced / (queries - missing)`.
     pub traced_share: f64,
+    /// `trust.tolerance`: allowed optical residual.
+    #[serde(default)]
+    pub tolerance: f64,
     /// Estimated optical residual of the picture above the tolerance. `None` if within it. With a spent tracing budget it is measured on the
     /// untrusted points, and 0 if they are within the tolerance.
     pub tolerance_excess: Option<f64>,

@@ -8,12 +8,6 @@ const COLOURS = ["--blue", "--orange", "--green", "--purple", "--vermillion", "-
 
 const pick = (value) => (Number.isFinite(value) ? value : null);
 
-/** Tolerance, as far as a record tells it. With a spent budget the excess is that of other points. */
-function toleranceOf(record) {
-  const [error, excess] = [record.trusted_error?.optical_rms, record.tolerance_excess];
-  return error != null && excess > 0 && !(record.over_budget > 0) ? error - excess : null;
-}
-
 /** The numbers of a record that the charts show. */
 export function rowOf(record) {
   const { picture_error: picture, trusted_error: trusted, seconds, live } = record;
@@ -26,7 +20,7 @@ export function rowOf(record) {
     trusted: pick(trusted?.optical_rms),
     trustedLow: pick(trusted?.optical_rms_interval?.[0]),
     trustedHigh: pick(trusted?.optical_rms_interval?.[1]),
-    tolerance: pick(toleranceOf(record)),
+    tolerance: trusted ? pick(record.tolerance) : null,
     traced: pick(record.traced_share),
     loss: pick(record.training?.loss),
     time: live ? pick(record.time) : null,
