@@ -7,8 +7,11 @@ use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, Step
 use crate::render::Transfer;
 use crate::trust::Strata;
 
-/// Largest optical residual of the steps, as a part of `trust.tolerance`: where the surrogate has that residual, the steps add a fifth to it.
+/// Largest optical residual of the steps, as a part of `trust.tolerance`, in flows of three dimensions, whose errors average along a ray: pictures of
+/// turbulence differ by 57 dB then (`docs/accuracy.md`).
 const SHARE: f64 = 2.0 / 3.0;
+/// The same in two dimensions, where a ray sees one value: a residual of 0.007 left a picture 40 dB.
+const FLAT_SHARE: f64 = 1.0 / 15.0;
 /// Smallest number of points on which something is to be seen.
 const MIN_SHOWN: usize = 64;
 /// Random stream of the points on which steps are compared.
@@ -25,7 +28,7 @@ pub(super) struct PictureSteps {
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most [`SHARE`]
-/// of the tolerance. `None` if there is none below those `chosen` for the log-stretch, if the method or the scene asks for these, or if too few points
+/// or [`FLAT_SHARE`] of the tolerance. `None` if there is none below those `chosen` for the log-stretch, if the method or the scene asks for these, or if too few points
 /// show anything to judge by.
 ///
 /// # Errors
@@ -39,7 +42,7 @@ pub(super) fn picture_steps(
     let scene = &plan.scene;
     let is_open = scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth();
     let Some(chosen) = chosen.filter(|choice| is_open && choice.within_tolerance) else { return Ok(None) };
-    let cells = if plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
+    let (share, cells) = if plan.domain.dimensions == 3 { (SHARE, [16, 16, 8]) } else { (FLAT_SHARE, [64, 32, 1]) };
     // Not the seed of the picture, which would change the flow map.
     let unit = stratified_points(&Strata::even(cells, 1), 0, STREAM);
     let mut points: Vec<[f32; 3]> = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
@@ -67,7 +70,7 @@ pub(super) fn picture_steps(
             // The colours may differ as much as they can.
             _ => 1.0,
         }));
-        if residual <= SHARE * scene.trust.tolerance {
+        if residual <= share * scene.trust.tolerance {
             let difference = upper_rms(pairs().map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
             return Ok(Some(PictureSteps { steps, difference, residual }));
         }

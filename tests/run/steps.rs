@@ -26,7 +26,7 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
         let found = report(kind, keys, "two_level", &[]);
         let (most, steps) = (full.integration_steps.unwrap(), found.integration_steps.unwrap());
         assert_eq!(full.integration_residual, None, "tracking is the reference of other methods");
-        assert!(3 * steps <= 2 * most, "{kind}: {steps} of {most} steps");
+        assert!(4 * steps <= 3 * most, "{kind}: {steps} of {most} steps");
         assert_eq!(report(kind, keys, "marched", &[]).integration_steps, Some(steps));
         for method in ["gated", "surrogate"] {
             assert_eq!(report(kind, keys, method, &[]).integration_steps, Some(most), "{method}");
@@ -58,7 +58,8 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
         let (ours, theirs) = (ramps(&*tracer), ramps(&*truth));
         let rms = (ours.iter().zip(&theirs).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / points.len() as f64).sqrt();
         println!("{kind}: {steps} of {most} steps: residual {rms:.4}, stated {:.4}", found.integration_residual.unwrap());
-        assert!(rms <= TrustSettings::default().tolerance, "{kind}: {rms} with {steps} steps");
+        let share = if plan.domain.dimensions == 3 { 1.0 } else { 0.1 };
+        assert!(rms <= share * TrustSettings::default().tolerance, "{kind}: {rms} with {steps} steps");
         let stated = found.integration_residual.unwrap();
         assert!((0.7..=1.5).contains(&(stated / rms)), "{kind}: {rms}, stated {stated}");
     }
