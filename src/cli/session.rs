@@ -7,7 +7,7 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, PublishSettings, RunFolder, Summary};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, Peers, PublishError, PublishSettings, RunFolder, Summary};
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
 use std::path::PathBuf;
@@ -192,14 +192,18 @@ impl Session<'_> {
 /// at the private one.
 fn start_shown(publish: &mut PublishSettings) -> Result<Output, PublishError> {
     if publish.endpoint.is_none() {
+        let mut shown = PublishSettings { peers: Some(Peers::User), ..publish.clone() };
         for endpoint in [DEFAULT_ENDPOINT, "tcp://127.0.0.1:0"] {
-            publish.endpoint = Some(endpoint.to_owned());
-            match Output::start(publish, None) {
-                Ok(output) => return Ok(output),
-                Err(error) => messages::note(format_args!("no frames for the dashboard: {error}")),
+            shown.endpoint = Some(endpoint.to_owned());
+            match Output::start(&shown, None) {
+                Ok(output) => {
+                    *publish = shown;
+                    return Ok(output);
+                }
+                Err(error) => tracing::info!("no frames for the dashboard: {error}"),
             }
         }
-        publish.endpoint = None;
+        messages::note("no frames for the dashboard: neither the private endpoint nor another one is free (--publish names one)");
     }
     Output::start(publish, None)
 }

@@ -2,7 +2,7 @@
 
 use super::error::DashboardError;
 use super::token::Token;
-use axum::http::header::{COOKIE, HOST, HeaderMap, HeaderName, ORIGIN};
+use axum::http::header::{HOST, HeaderMap, HeaderName, ORIGIN};
 use axum::http::uri::{Authority, Uri};
 use std::net::{IpAddr, SocketAddr};
 
@@ -50,7 +50,7 @@ impl Access {
         }
     }
 
-    /// Refuses connections that a page of another origin opens, which would come with the cookie. Programs that are no browser send no origin.
+    /// Refuses connections that a page of another origin opens. Programs that are no browser send no origin.
     pub fn check_origin(&self, headers: &HeaderMap) -> Result<(), Refused> {
         if !headers.contains_key(ORIGIN) {
             return Ok(());
@@ -60,32 +60,20 @@ impl Access {
         let name = origin.host().ok_or(ORIGIN_REFUSED)?;
         let default = if origin.scheme_str() == Some("https") { 443 } else { 80 };
         let is_same = name.eq_ignore_ascii_case(host.host()) && origin.port_u16().unwrap_or(default) == host.port_u16().unwrap_or(default);
-        // Some proxies put a name of their own in place of the host that the browser sent.
-        if is_same || self.hosts.iter().any(|host| name.eq_ignore_ascii_case(host)) { Ok(()) } else { Err(ORIGIN_REFUSED) }
+        // Some proxies put a name of their own in place of the host that the browser sent. Under the same name, another port is another server.
+        let is_renamed = !name.eq_ignore_ascii_case(host.host()) && self.hosts.iter().any(|host| name.eq_ignore_ascii_case(host));
+        if is_same || is_renamed { Ok(()) } else { Err(ORIGIN_REFUSED) }
     }
 
-    /// Accepts the token in the query, or else in the cookie.
-    pub fn check_token(&self, uri: &Uri, headers: &HeaderMap) -> Result<(), Refused> {
-        let query = uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix("token="));
-        let name = self.cookie_name();
-        let cookie = || {
-            let lines = headers.get_all(COOKIE).iter().filter_map(|line| line.to_str().ok());
-            let mut cookies = lines.flat_map(|line| line.split(';')).filter_map(|cookie| cookie.trim().split_once('='));
-            cookies.find(|(key, _)| *key == name).map(|(_, value)| value)
-        };
-        let given = query.or_else(cookie);
-        if given.is_some_and(|given| self.token.is(given)) { Ok(()) } else { Err(NO_TOKEN) }
+    /// Accepts the token in the query. A cookie would go to all servers of this host, whatever their port.
+    pub fn check_token(&self, uri: &Uri) -> Result<(), Refused> {
+        if given_token(uri).is_some_and(|given| self.token.is(given)) { Ok(()) } else { Err(NO_TOKEN) }
     }
+}
 
-    /// Cookie by which a browser keeps the token. Without a path it is sent to the folder of the page alone, whatever path a proxy gives it.
-    pub fn cookie(&self) -> String {
-        format!("{}={}; HttpOnly; SameSite=Strict", self.cookie_name(), self.token.secret())
-    }
-
-    /// Ports of a host share their cookies.
-    fn cookie_name(&self) -> String {
-        format!("ridgewatch-{}", self.address.port())
-    }
+/// The token of a request, right or wrong.
+pub(super) fn given_token(uri: &Uri) -> Option<&str> {
+    uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix("token="))
 }
 
 /// Value of a header that may come once.
@@ -151,6 +139,8 @@ mod tests {
             ("http://127.0.0.1:8578", "127.0.0.1:8577", false),
             ("http://localhost:8577", "127.0.0.1:8577", false),
             ("https://portal.example.org", "node17:8577", true),
+            // Another server under the name of a proxy.
+            ("http://portal.example.org:9000", "portal.example.org:8577", false),
             ("https://evil.example.org", "127.0.0.1:8577", false),
             ("null", "127.0.0.1:8577", false),
             ("file://", "127.0.0.1:8577", false),
@@ -162,16 +152,11 @@ mod tests {
     }
 
     #[test]
-    fn the_token_comes_by_query_or_cookie() {
+    fn the_token_comes_by_query() {
         let access = access(&[], "127.0.0.1:8577");
         let token = access.token.secret().to_owned();
-        let check =
-            |query: &str, cookie: &str| access.check_token(&format!("/{query}").parse().unwrap(), &headers(&[(COOKIE, cookie)])).is_ok();
-        assert!(check(&format!("?token={token}"), "") && check(&format!("?a=1&token={token}"), ""));
-        assert!(check("", &format!("a=b; ridgewatch-8577={token}")));
-        assert!(access.cookie().starts_with(&format!("ridgewatch-8577={token};")));
-        assert!(!check("", "") && !check("?token=", "") && !check(&format!("?token={}", &token[1..]), ""));
-        assert!(!check("", &format!("ridgewatch-8578={token}")), "of another port");
-        assert!(!check("?token=wrong", &format!("ridgewatch-8577={token}")), "a wrong token is not forgiven");
+        let check = |query: &str| access.check_token(&format!("/{query}").parse().unwrap()).is_ok();
+        assert!(check(&format!("?token={token}")) && check(&format!("?a=1&token={token}")));
+        assert!(!check("") && !check("?token=") && !check(&format!("?token={}", &token[1..])) && !check("?token=wrong"));
     }
 }

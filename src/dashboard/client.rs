@@ -1,6 +1,6 @@
 //! One browser: pictures at its pace, records, and the state of the publisher.
 
-use super::hub::Hub;
+use super::hub::{Hub, Place};
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use bytes::Bytes;
 use serde::Deserialize;
@@ -36,19 +36,22 @@ enum Turn {
     Picture,
     Records,
     Tick,
-    Displaced,
 }
 
 /// Serves a browser until it leaves, is lost, or loses its place.
 pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
-    if let End::Closed(code, reason) = talk(&mut socket, hub).await {
+    let place = hub.enter();
+    let end = tokio::select! {
+        end = talk(&mut socket, &hub, &place) => end,
+        () = place.displaced.notified() => End::Closed(DISPLACED, "too many pages are open; this one has drawn nothing for longest"),
+    };
+    if let End::Closed(code, reason) = end {
         let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
         let _ = timeout(STATE, socket.send(close)).await;
     }
 }
 
-async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
-    let place = hub.enter();
+async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place) -> End {
     let (mut pictures, mut recorded) = (hub.picture.subscribe(), hub.recorded.subscribe());
     // What is there already is news to this browser.
     pictures.mark_changed();
@@ -57,11 +60,10 @@ async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     // Sequence of the picture that it is drawing.
     let mut drawing: Option<u64> = None;
-    let (mut next_record, mut heard, mut has_pinged) = (0, Instant::now(), false);
+    let (mut next_record, mut heard, mut pinged) = (0, Instant::now(), None);
     loop {
         let turn = tokio::select! {
             message = socket.recv() => Turn::Heard(message),
-            () = place.displaced.notified() => Turn::Displaced,
             // The hub outlives this.
             _ = pictures.changed(), if drawing.is_none() => Turn::Picture,
             _ = recorded.changed() => Turn::Records,
@@ -69,7 +71,7 @@ async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
         };
         let sent = match turn {
             Turn::Heard(Some(Ok(message))) => {
-                (heard, has_pinged) = (Instant::now(), false);
+                (heard, pinged) = (Instant::now(), None);
                 match message {
                     Message::Text(text) => match serde_json::from_str::<Said>(&text) {
                         Ok(Said { ack }) => {
@@ -86,7 +88,6 @@ async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
                 Ok(())
             }
             Turn::Heard(_) => return End::Gone,
-            Turn::Displaced => return End::Closed(DISPLACED, "too many pages are open; this one has drawn nothing for longest"),
             Turn::Picture => {
                 let newest = pictures.borrow_and_update().clone();
                 match newest {
@@ -97,18 +98,19 @@ async fn talk(socket: &mut WebSocket, hub: Arc<Hub>) -> End {
                     None => Ok(()),
                 }
             }
-            Turn::Records => {
-                let mut sent = Ok(());
-                while let (Ok(()), Some((message, next))) = (&sent, hub.records_from(next_record)) {
-                    sent = send(socket, message).await;
+            Turn::Records => match hub.records_from(next_record) {
+                Some((message, next)) => {
                     next_record = next;
+                    // There may be more, after whatever else is due.
+                    recorded.mark_changed();
+                    send(socket, message).await
                 }
-                sent
-            }
-            Turn::Tick if heard.elapsed() > 2 * SILENCE => return End::Gone,
+                None => Ok(()),
+            },
+            Turn::Tick if pinged.is_some_and(|at: Instant| at.elapsed() > SILENCE) => return End::Gone,
             Turn::Tick => {
-                if heard.elapsed() > SILENCE && !has_pinged {
-                    has_pinged = true;
+                if heard.elapsed() > SILENCE && pinged.is_none() {
+                    pinged = Some(Instant::now());
                     if timeout(STALL, socket.send(Message::Ping(Bytes::new()))).await.is_err() {
                         return End::Gone;
                     }

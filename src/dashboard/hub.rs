@@ -12,13 +12,17 @@ use tokio::sync::{Notify, watch};
 
 /// Maximum length of a published message, in bytes: a lossless picture of 16 million pixels.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
+/// Maximum length of a picture that is shown, in bytes. Some proxies accept 10 MB.
+const MAX_PICTURE_BYTES: usize = 10_000_000 - MAX_JSON_BYTES;
+/// Maximum number of characters of a problem.
+const MAX_PROBLEM: usize = 300;
 /// Maximum length of the JSON of a message, in bytes.
 const MAX_JSON_BYTES: usize = 256 << 10;
 /// Records that are kept for browsers that come later, and their bytes.
 const MAX_KEPT_RECORDS: usize = 2000;
 const MAX_KEPT_BYTES: usize = 16 << 20;
 /// Bytes of records in one message. Some proxies accept 10 MB.
-const MAX_BATCH_BYTES: usize = 4 << 20;
+const MAX_BATCH_BYTES: usize = 1 << 20;
 /// Maximum number of browsers.
 const MAX_CLIENTS: usize = 64;
 /// Shortest time between two attempts to reach the publisher.
@@ -40,6 +44,8 @@ pub(super) struct Picture {
 #[derive(Debug)]
 pub(super) struct Hub {
     endpoint: String,
+    /// Tells this server from others, to pages that come back.
+    server: String,
     pub picture: watch::Sender<Option<Arc<Picture>>>,
     /// Number of records so far.
     pub recorded: watch::Sender<u64>,
@@ -62,6 +68,10 @@ struct Health {
     last_message: Option<Instant>,
     last_record: Option<Instant>,
     intervals: VecDeque<Duration>,
+    is_connected: bool,
+    /// Why the publisher cannot be followed.
+    link_problem: Option<String>,
+    /// Why pictures or records cannot be shown.
     problem: Option<String>,
 }
 
@@ -138,6 +148,7 @@ impl Hub {
     pub fn new(endpoint: String) -> Self {
         Self {
             endpoint,
+            server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
             recorded: watch::Sender::new(0),
             records: Mutex::default(),
@@ -166,13 +177,14 @@ impl Hub {
             let begin = tokio::time::Instant::now();
             match Subscriber::connect(&self.endpoint, &[FRAME_TOPIC, RECORD_TOPIC], MAX_MESSAGE_BYTES).await {
                 Ok(mut subscriber) => {
-                    lock(&self.health).problem = None;
-                    loop {
+                    lock(&self.health).connected();
+                    let error = loop {
                         match subscriber.receive().await {
                             Ok(parts) => self.take(&parts),
-                            Err(error) => break self.lost(&error),
+                            Err(error) => break error,
                         }
-                    }
+                    };
+                    self.lost(&error);
                 }
                 Err(error) => self.lost(&error),
             }
@@ -183,10 +195,14 @@ impl Hub {
     /// A publisher that is not there is waited for; anything else is said.
     fn lost(&self, error: &SubscribeError) {
         tracing::debug!("{}: {error}", self.endpoint);
+        let mut health = lock(&self.health);
+        health.is_connected = false;
         let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused, ErrorKind::UnexpectedEof, ErrorKind::ConnectionReset];
         match error {
             SubscribeError::System(error) if absent.contains(&error.kind()) => {}
-            error => lock(&self.health).problem = Some(format!("the publisher cannot be followed: {error}")),
+            // It comes again with the next picture, soon after the next connection.
+            SubscribeError::Length { .. } => health.problem = Some(short(&error.to_string())),
+            error => health.link_problem = Some(short(&format!("the publisher cannot be followed: {error}"))),
         }
     }
 
@@ -200,7 +216,7 @@ impl Hub {
         let mut health = lock(&self.health);
         health.last_message = Some(Instant::now());
         if let Err(problem) = taken {
-            health.problem = Some(problem);
+            health.problem = Some(short(&problem));
         }
     }
 
@@ -235,6 +251,12 @@ impl Hub {
         if !["jpeg", "png"].contains(&encoding.as_str()) {
             return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg and png (publish.payload)"));
         }
+        if picture.len() > MAX_PICTURE_BYTES {
+            return Err(format!(
+                "a picture of {} bytes; shown are up to {MAX_PICTURE_BYTES} (publish.payload = \"jpeg\" is smaller)",
+                picture.len()
+            ));
+        }
         if payload_bytes != picture.len() {
             return Err(format!("a picture of {} bytes, of which its header says {payload_bytes}", picture.len()));
         }
@@ -251,7 +273,9 @@ impl Hub {
     /// Message with the records from number `from` on, and the number after the last of them. `None` if there are none.
     pub fn records_from(&self, from: u64) -> Option<(Bytes, u64)> {
         let (batch, skipped, next) = lock(&self.records).from(from)?;
-        let json = format!(r#"{{"kind":"records","records":[{}],"skipped":{skipped}}}"#, batch.join(","));
+        let (server, first) = (&self.server, from + skipped);
+        let json =
+            format!(r#"{{"kind":"records","server":{server:?},"first":{first},"records":[{}],"skipped":{skipped}}}"#, batch.join(","));
         Some((message(&json, &[]), next))
     }
 
@@ -267,13 +291,19 @@ impl Hub {
             seconds_since_message: silence.map(|silence| silence.as_secs_f64()),
             clients,
             version: env!("CARGO_PKG_VERSION"),
-            problem: health.problem.clone(),
+            problem: health.link_problem.clone().or_else(|| health.problem.clone()),
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
     }
 }
 
 impl Health {
+    /// Another run may have other intervals.
+    fn connected(&mut self) {
+        (self.is_connected, self.link_problem, self.last_record) = (true, None, None);
+        self.intervals.clear();
+    }
+
     /// Before the first interval, the frame's own `seconds` stand for it.
     fn note_record(&mut self, now: Instant, seconds: Option<f64>) {
         let own = || Duration::try_from_secs_f64(seconds.unwrap_or_default()).unwrap_or_default();
@@ -288,8 +318,9 @@ impl Health {
         let Some(silence) = silence else { return Status::Waiting };
         let mut sorted: Vec<_> = self.intervals.iter().copied().collect();
         sorted.sort_unstable();
-        let usual = sorted.get(sorted.len() / 2).copied().unwrap_or_default();
-        if silence > SILENT.max(usual * SILENT_INTERVALS) { Status::Silent } else { Status::Following }
+        let usual = sorted.get(sorted.len().saturating_sub(1) / 2).copied().unwrap_or_default();
+        let longest = if self.is_connected { SILENT.max(usual.saturating_mul(SILENT_INTERVALS)) } else { SILENT };
+        if silence > longest { Status::Silent } else { Status::Following }
     }
 }
 
@@ -336,6 +367,11 @@ fn message(json: &str, picture: &[u8]) -> Bytes {
     [&length.to_le_bytes(), json.as_bytes(), picture].concat().into()
 }
 
+/// The beginning of a text that another program may have written.
+fn short(text: &str) -> String {
+    text.chars().take(MAX_PROBLEM).collect()
+}
+
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -348,6 +384,7 @@ mod tests {
     fn a_publisher_is_silent_after_five_of_its_intervals() {
         let seconds = Duration::from_secs_f64;
         let mut health = Health::default();
+        health.connected();
         assert_eq!(health.status(None), Status::Waiting);
         let begin = Instant::now();
         health.note_record(begin, Some(2.0));
@@ -360,8 +397,15 @@ mod tests {
         }
         assert_eq!(health.status(Some(seconds(2.9))), Status::Following);
         assert_eq!(health.status(Some(seconds(3.1))), Status::Silent);
-        for odd in [f64::NAN, -1.0, f64::MAX] {
-            Health::default().note_record(begin, Some(odd));
+        health.is_connected = false;
+        health.intervals = [seconds(60.0); INTERVALS].into();
+        assert_eq!(health.status(Some(seconds(2.9))), Status::Following);
+        assert_eq!(health.status(Some(seconds(3.1))), Status::Silent, "its connection has ended");
+        for odd in [f64::NAN, -1.0, 1e19, f64::MAX] {
+            let mut health = Health::default();
+            health.connected();
+            health.note_record(begin, Some(odd));
+            health.status(Some(seconds(1.0)));
         }
     }
 }

@@ -1,13 +1,12 @@
 //! HTTP: the page, its files, and the WebSocket.
 
-use super::access::{Access, Refused};
+use super::access::{Access, Refused, given_token};
 use super::hub::Hub;
 use super::{client, files};
 use axum::body::Body;
 use axum::extract::{FromRequestParts, Request, WebSocketUpgrade};
 use axum::http::header::{
-    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, REFERRER_POLICY, SET_COOKIE,
-    X_CONTENT_TYPE_OPTIONS,
+    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
 };
 use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
@@ -104,13 +103,15 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
     }
     let path = parts.uri.path();
     if path.ends_with('/') {
-        access.check_token(&parts.uri, &parts.headers)?;
-        let cookie = HeaderValue::from_str(&access.cookie()).map_err(|_| "The token cannot be a cookie.\n")?;
-        return Ok((HeaderMap::from_iter([(SET_COOKIE, cookie)]), file(files::PAGE)).into_response());
+        // The page holds no data: without a token it says how to get one. It learns here why a WebSocket was refused.
+        if given_token(&parts.uri).is_some() {
+            access.check_token(&parts.uri)?;
+        }
+        return Ok(file(files::PAGE).into_response());
     }
     if path.ends_with("/socket") {
         access.check_origin(&parts.headers)?;
-        access.check_token(&parts.uri, &parts.headers)?;
+        access.check_token(&parts.uri)?;
         return Ok(match WebSocketUpgrade::from_request_parts(&mut parts, &()).await {
             Ok(upgrade) => {
                 upgrade.max_message_size(MAX_SAID_BYTES).max_frame_size(MAX_SAID_BYTES).on_upgrade(move |socket| client::serve(socket, hub))

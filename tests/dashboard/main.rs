@@ -165,12 +165,13 @@ fn strangers_are_refused() {
     let port = address.port();
     let (page, socket) = (format!("/?token={token}"), format!("/socket?token={token}"));
     let host = format!("Host: {address}");
-    let cookie = format!("Cookie: ridgewatch-{port}={token}");
+    let cookie = format!("Cookie: ridgewatch-{port}={token}; token={token}");
     let origin = format!("Origin: http://{address}");
     for (target, lines, status) in [
         (socket.as_str(), &[host.as_str(), &origin][..], 101),
-        ("/socket", &[&host, &origin, &cookie], 101),
-        ("/node/node17/8577/socket", &[&host, &origin, &cookie], 101),
+        (&format!("/node/node17/8577/socket?token={token}"), &[&host, &origin], 101),
+        // Cookies go to all servers of a host.
+        ("/socket", &[&host, &origin, &cookie], 403),
         (&socket, &[&host], 101),
         ("/socket", &[&host, &origin], 403),
         ("/socket?token=", &[&host, &origin], 403),
@@ -179,7 +180,6 @@ fn strangers_are_refused() {
         (&socket, &[&host, "Origin: https://evil.example.org"], 403),
         (&socket, &[&host, "Origin: null"], 403),
         (&socket, &[&host, &format!("Origin: http://{}:{}", address.ip(), port ^ 1)], 403),
-        ("/socket", &[&host, &cookie, "Origin: https://evil.example.org"], 403),
         // A name that a stranger points at this machine: host and origin agree.
         (&socket, &["Host: evil.example.org", "Origin: http://evil.example.org"], 403),
         (&socket, &[&host, "Host: evil.example.org", &origin], 403),
@@ -187,10 +187,12 @@ fn strangers_are_refused() {
         assert_eq!(socket_status(address, target, lines), status, "{target} {lines:?}");
     }
     assert_eq!(get(address, &page, &[]).0, 200);
-    assert_eq!(get(address, "/", &[&cookie]).0, 200);
-    for target in ["/", "/?token=", "/?token=wrong", "/node/node17/8577/"] {
+    // The page itself holds no data.
+    let (status, text) = get(address, "/", &[]);
+    assert!(status == 200 && !text.contains(token), "{text}");
+    for target in ["/?token=", "/?token=wrong", "/node/node17/8577/?token=wrong"] {
         let (status, text) = get(address, target, &[]);
-        assert!(status == 403 && text.contains("token") && !text.contains(token) && !text.contains("Set-Cookie"), "{text}");
+        assert!(status == 403 && text.contains("token") && !text.contains(token), "{text}");
     }
     assert_eq!(ask(address, &format!("GET {page} HTTP/1.1\r\nHost: evil.example.org\r\nConnection: close\r\n\r\n")).0, 403);
     assert_eq!(ask(address, &format!("GET {page} HTTP/1.1\r\nConnection: close\r\n\r\n")).0, 403);
@@ -202,8 +204,7 @@ fn the_page_and_its_files_come_with_their_policy() {
     let stage = Stage::new();
     let (status, page) = get(stage.address(), &format!("/?token={}", stage.token), &[]);
     assert_eq!(status, 200);
-    let cookie = page.lines().find(|line| line.to_lowercase().starts_with("set-cookie:")).unwrap();
-    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"), "{cookie}");
+    assert!(!page.to_lowercase().contains("set-cookie"), "{page}");
     // Only the host's own script and style, as the policy demands.
     assert!(page.contains("<html") && !page.contains("<script>") && !page.contains("style=\"") && !page.contains("//cdn"));
     for (target, media_type) in [("/page.js", "text/javascript"), ("/style.css", "text/css"), ("/some/prefix/page.js", "text/javascript")] {
@@ -335,7 +336,8 @@ fn a_page_that_says_something_else_is_disconnected() {
     let mut visitor = stage.visit();
     // Of a picture that was never sent.
     visitor.acknowledge(1 << 60);
-    visitor.until_state(|_| true);
+    // The first may be older than the acknowledgement.
+    (0..3).for_each(|_| drop(visitor.until_state(|_| true)));
 }
 
 #[test]

@@ -3,8 +3,8 @@ import { parseMessage } from "./protocol.js";
 
 const FIRST_DELAY = 500;
 const LONGEST_DELAY = 15_000;
-// The server sends its state at least every second.
-const LONGEST_SILENCE = 6_000;
+// The server sends its state every second, but for the time that a picture takes.
+const LONGEST_SILENCE = 12_000;
 const LONGEST_HANDSHAKE = 10_000;
 // The server closed this page in favour of others.
 const DISPLACED = 4001;
@@ -87,14 +87,13 @@ export class Connection {
 
   // A browser does not tell the page why a handshake failed.
   async askWhy() {
+    if (!this.token) { this.status = "refused"; return; }
     const address = page();
-    if (this.token) address.searchParams.set("token", this.token);
+    address.searchParams.set("token", this.token);
     try {
       const answer = await fetch(address, { method: "HEAD", signal: AbortSignal.timeout(5000) });
       if (this.status === "open") return;
       this.status = answer.status === 403 ? "refused" : "lost";
-      // The token may be of an earlier server, and the cookie, which all tabs share, of this one.
-      if (answer.status === 403) this.token = null;
     } catch {
       if (this.status !== "open") this.status = "lost";
     }

@@ -24,6 +24,8 @@ const charts = new Charts(element("charts"), (frame) => picture.lookBack(picture
 
 let connection;
 let newest = null;
+// The server, and the number of the record that it sends next.
+let counted = { server: null, next: 0 };
 let server = null;
 let heard = null;
 let chartsDue = false;
@@ -39,8 +41,17 @@ function unseen(list) {
   return list.slice(seen + 1).filter((record) => !records.has(rowOf(record)));
 }
 
-function receiveRecords(list) {
-  const fresh = unseen(list.filter((record) => Number.isFinite(record?.frame)));
+/** Records behind those that this server has sent already, by their numbers there. */
+function behind({ records: list, server, first }) {
+  const next = server === counted.server ? counted.next : 0;
+  counted = { server, next: Math.max(next, first + list.length) };
+  return list.slice(Math.max(0, next - first));
+}
+
+function receiveRecords(message) {
+  const isKnown = message.server === counted.server;
+  const list = behind(message).filter((record) => Number.isFinite(record?.frame));
+  const fresh = isKnown ? list : unseen(list);
   // What a server tells first is the past.
   const watched = newest !== null;
   for (const record of fresh) {
@@ -75,7 +86,7 @@ function receiveState(state) {
 
 const RECEIVERS = {
   frame: receiveFrame,
-  records: (message) => receiveRecords(Array.isArray(message.records) ? message.records : []),
+  records: receiveRecords,
   state: receiveState,
 };
 
@@ -103,7 +114,7 @@ function kindOf(view) {
   return view.back ? "back" : "following";
 }
 
-const STALE = ["lost", "refused", "displaced", "silent"];
+const STALE = ["lost", "refused", "displaced", "silent", "waiting"];
 
 function pictureChanged(shown) {
   const { record } = shown.header;

@@ -62,7 +62,7 @@ export class Warnings {
       this.hold("budget", `Tracing budget spent: ${count(overBudget)} queries in untrusted cells were answered by the surrogate`, frame, fresh);
     }
     if (checkpoint?.failed) this.hold("checkpoint", `A checkpoint could not be written: ${checkpoint.failed}`, frame, fresh);
-    this.readWarnings(record.warnings ?? [], frame, fresh);
+    this.readWarnings(Array.isArray(record.warnings) ? record.warnings : [], frame, fresh);
     if (record.live) this.readLive(record, fresh);
   }
 
@@ -82,7 +82,7 @@ export class Warnings {
       this.hold("coarse", `Coarse in time: so far ${count(live.steps_skipped)} steps were left out for lack of memory${error}`, frame, fresh);
     }
     if (live.restarts > (before?.restarts ?? 0)) this.hold("restart", `The simulation restarted: so far ${count(live.restarts)} times`, frame, fresh);
-    if ((warnings ?? []).some((text) => LOST_SIMULATION.test(text))) this.lostAtStep = live.step;
+    if (Array.isArray(warnings) && warnings.some((text) => LOST_SIMULATION.test(text))) this.lostAtStep = live.step;
     else if (live.step !== this.lostAtStep) this.lostAtStep = null;
     this.live = live;
   }
@@ -118,6 +118,9 @@ function connectionConditions(view, now) {
   if (view.link !== "open") return [];
   const found = [];
   if (view.problem) found.push({ id: "problem", level: "critical", text: view.problem });
+  if (view.status === "waiting" && view.record) {
+    found.push({ id: "silent", level: "critical", text: "Nothing has arrived since this server started. The picture is of an earlier time." });
+  }
   if (view.status === "silent") {
     found.push({ id: "silent", level: "critical", text: "Nothing new arrives: the run has ended, pauses, or is lost.", tick: `silent for ${silence}` });
   }
