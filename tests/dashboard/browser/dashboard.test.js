@@ -283,7 +283,7 @@ test("a connection that drops comes back, and nothing is told twice", async () =
 test("a connection that is open in name only is noticed", async () => {
   await following();
   proxy.mute = true;
-  await until("the loss is said", async () => /^Not connected/.test(await state()), 9_000);
+  await until("the loss is said", async () => /^Not connected/.test(await state()), 15_000);
   proxy.mute = false;
   await following();
 });
