@@ -35,7 +35,7 @@ CARGO_FUZZ_VERSION := 0.13.2
 # Checks the dependencies.
 CARGO_DENY := target/cargo-deny
 CARGO_DENY_VERSION := 0.19.0
-FUZZ_TARGETS := ring message netcdf checkpoint scene
+FUZZ_TARGETS := ring message zmtp netcdf checkpoint scene
 FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
@@ -143,11 +143,12 @@ fuzz: packages $(CARGO_FUZZ)/bin/cargo-fuzz
 	done
 
 $(CARGO_DENY)/bin/cargo-deny:
-	$(CARGO) install --quiet --locked --root $(CARGO_DENY) cargo-deny --version $(CARGO_DENY_VERSION)
+	@# Unoptimised: it is built in a minute, and checks in seconds.
+	CARGO_PROFILE_DEV_DEBUG=0 $(CARGO) install --quiet --locked --debug --root $(CARGO_DENY) cargo-deny --version $(CARGO_DENY_VERSION)
 
 # Without the advisories, whose database needs the network: `target/cargo-deny/bin/cargo-deny check advisories`.
 deny: $(CARGO_DENY)/bin/cargo-deny
-	$(CARGO_DENY)/bin/cargo-deny --locked check bans licenses sources
+	$(CARGO_DENY)/bin/cargo-deny --locked check --hide-inclusion-graph bans licenses sources
 
 .venv/installed: Makefile | python-packages
 	$(PYTHON) -m venv .venv

@@ -244,22 +244,6 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     }
     assert!(matches!(network.load(&folder.path().join("missing")), Err(CheckpointError::Io { .. })));
 
-    // Weights that are not finite, with a checksum that fits.
-    let mut odd = good.clone();
-    let begin = 8 + u64::from_le_bytes(odd[..8].try_into().unwrap()) as usize;
-    odd[begin..].chunks_exact_mut(4).for_each(|value| value.copy_from_slice(&f32::NAN.to_le_bytes()));
-    let sum = |bytes: &[u8]| {
-        let words = bytes[begin..].chunks_exact(4).map(|b| u64::from(u32::from_le_bytes(b.try_into().unwrap())));
-        format!("{:016x}", words.fold(0xcbf2_9ce4_8422_2325_u64, |sum, word| (sum ^ word).wrapping_mul(0x0000_0100_0000_01b3)))
-    };
-    let at = good.windows(16).position(|window| window == sum(&good).as_bytes()).unwrap();
-    let fitting = sum(&odd);
-    odd[at..at + 16].copy_from_slice(fitting.as_bytes());
-    std::fs::write(&path, &odd).unwrap();
-    let fault = network.load(&path).unwrap_err().to_string();
-    assert!(fault.contains("that are not finite; expected finite weights"), "{fault}");
-    assert_eq!(rms(&network, &samples), reference);
-
     // 64 GB without content are not read: this machine has no such memory.
     std::fs::write(&path, &good).unwrap();
     std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(64 << 30).unwrap();
@@ -280,6 +264,62 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     assert_eq!(rms(&network, &samples), reference);
     // A folder that is not there: an error, and nothing written.
     assert!(matches!(network.save(&folder.path().join("no/such/checkpoint")), Err(CheckpointError::Io { .. })));
+}
+
+/// FNV-1a over the values' words, as a checkpoint has it.
+fn checksum(values: &[u8]) -> String {
+    let words = values.chunks_exact(4).map(|b| u64::from(u32::from_le_bytes(b.try_into().unwrap())));
+    format!("{:016x}", words.fold(0xcbf2_9ce4_8422_2325_u64, |sum, word| (sum ^ word).wrapping_mul(0x0000_0100_0000_01b3)))
+}
+
+/// A checkpoint with other notes and values, and a checksum that fits.
+fn altered(good: &[u8], notes: &[(&str, &str)], change: impl FnOnce(&mut [u8])) -> Vec<u8> {
+    let begin = 8 + u64::from_le_bytes(good[..8].try_into().unwrap()) as usize;
+    let mut header: serde_json::Value = serde_json::from_slice(&good[8..begin]).unwrap();
+    let mut values = good[begin..].to_vec();
+    change(&mut values);
+    for (key, text) in notes.iter().copied().chain([("checksum", checksum(&values).as_str())]) {
+        let note = header["__metadata__"].get_mut(key).unwrap_or_else(|| panic!("no note {key}"));
+        *note = text.into();
+    }
+    let mut header = serde_json::to_vec(&header).unwrap();
+    header.resize(header.len().next_multiple_of(8), b' ');
+    [&(header.len() as u64).to_le_bytes()[..], &header, &values].concat()
+}
+
+#[test]
+fn numbers_that_are_not_finite_are_refused_in_every_checkpoint() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let samples = traced(&tracer, uniform_points(1, 3_000), false);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("checkpoint");
+    let not_a_number = f32::NAN.to_le_bytes();
+    for kind in [Kind::Table, Kind::Network, Kind::Residual] {
+        let mut taught = surrogate(kind, &small(), &tracer);
+        taught.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap();
+        taught.save(&path).unwrap();
+        let (good, reference) = (std::fs::read(&path).unwrap(), rms(&taught, &samples));
+        let mut load = |bytes: Vec<u8>| {
+            std::fs::write(&path, bytes).unwrap();
+            let loaded = taught.load(&path);
+            assert_eq!(rms(&taught, &samples), reference, "{kind:?}");
+            loaded.err().map(|error| error.to_string())
+        };
+        assert_eq!(load(altered(&good, &[], |_| {})), None, "{kind:?}: what is altered by nothing is taken");
+        for stride in [4, good.len() / 40 * 4] {
+            let odd = altered(&good, &[], |values| values.chunks_mut(stride).for_each(|part| part[..4].copy_from_slice(&not_a_number)));
+            let fault = load(odd).unwrap_or_else(|| panic!("{kind:?}: taken with a NaN every {stride} bytes"));
+            assert!(fault.contains("that are not finite; expected finite values"), "{kind:?}: {fault}");
+        }
+        let of_network = ["stall", "caution", "first_loss", "smooth", "looked", "mean.0", "deviation.0"].map(|key| format!("network.{key}"));
+        let keys = of_network.iter().map(String::as_str).filter(|_| kind != Kind::Table);
+        for key in keys.chain((kind == Kind::Residual).then_some("shrinkage")) {
+            for number in ["NaN", "inf", "-1e999"] {
+                let fault = load(altered(&good, &[(key, number)], |_| {})).unwrap_or_else(|| panic!("{kind:?}: taken with {key} {number}"));
+                assert!(fault.contains(key) && fault.contains(" from "), "{fault}");
+            }
+        }
+    }
 }
 
 #[test]

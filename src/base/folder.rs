@@ -101,13 +101,22 @@ impl Folder {
     /// # Errors
     /// Errors of the system; then the place is unchanged.
     pub fn write_whole(&self, name: impl AsRef<OsStr>, bytes: &[u8]) -> io::Result<()> {
+        self.write_with(name, |file| file.write_all(bytes))
+    }
+
+    /// As [`Folder::write_whole`], with what `write` puts into the new file.
+    ///
+    /// # Errors
+    /// Errors of the system and of `write`; then the place is unchanged.
+    pub fn write_with<E: From<io::Error>>(&self, name: impl AsRef<OsStr>, write: impl FnOnce(&mut File) -> Result<(), E>) -> Result<(), E> {
         let name = name.as_ref();
         let part = [".".as_ref(), name, ".part".as_ref()].into_iter().collect::<OsString>();
         match self.remove(&part) {
-            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error.into()),
             _ => {}
         }
-        let written = self.create_new(&part).and_then(|mut file| file.write_all(bytes)).and_then(|()| self.rename(&part, self, name));
+        let written = self.create_new(&part).map_err(E::from).and_then(|mut file| write(&mut file));
+        let written = written.and_then(|()| Ok(self.rename(&part, self, name)?));
         if written.is_err() {
             // It may not exist; `written` has the error that matters.
             let _ = self.remove(&part);

@@ -11,9 +11,10 @@ use ridgewatch_base::folder::Folder;
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
 use std::ffi::{OsStr, OsString};
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Read, Write};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -194,10 +195,18 @@ impl<'a> Checkpoint<'a> {
             .ok_or_else(|| self.mismatch(format!("{key} {}", text.unwrap_or("missing")), format!("{key} as a number")))
     }
 
+    /// Parses a note as a number in a range. NaN is in none.
+    pub(super) fn number_in<T: FromStr + PartialOrd + Display>(&self, key: &str, range: RangeInclusive<T>) -> Result<T, CheckpointError> {
+        let number: T = self.number(key)?;
+        if range.contains(&number) {
+            return Ok(number);
+        }
+        Err(self.mismatch(format!("{key} {number}"), format!("{key} from {} to {}", range.start(), range.end())))
+    }
+
     /// Parses a note as a finite number.
     pub(super) fn finite(&self, key: &str) -> Result<f32, CheckpointError> {
-        let number: f32 = self.number(key)?;
-        if number.is_finite() { Ok(number) } else { Err(self.mismatch(format!("{key} {number}"), format!("{key} as a finite number"))) }
+        self.number_in(key, f32::MIN..=f32::MAX)
     }
 
     /// A tensor of `len` finite values.
@@ -205,12 +214,12 @@ impl<'a> Checkpoint<'a> {
         let values = self.values(name, len)?;
         match values.iter().filter(|value| !value.is_finite()).count() {
             0 => Ok(values),
-            odd => Err(self.mismatch(format!("{name} with {odd} of {len} values that are not finite"), "finite weights".into())),
+            odd => Err(self.mismatch(format!("{name} with {odd} of {len} values that are not finite"), "finite values".into())),
         }
     }
 
     /// A tensor of `len` values.
-    pub(super) fn values(&self, name: &str, len: usize) -> Result<Vec<f32>, CheckpointError> {
+    fn values(&self, name: &str, len: usize) -> Result<Vec<f32>, CheckpointError> {
         match self.entries.iter().find(|entry| entry.name == name) {
             Some(entry) if entry.values.len() == len => Ok(entry.values.to_vec()),
             Some(entry) => Err(self.mismatch(format!("{name} of {} values", entry.values.len()), format!("{len} values"))),

@@ -273,7 +273,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         };
         let (mut slid, mut shrinkage) = (self.slid, self.shrinkage);
         if self.kind == Kind::Residual {
-            (slid, shrinkage) = (checkpoint.number("slid")?, checkpoint.finite("shrinkage")?);
+            (slid, shrinkage) = (checkpoint.number("slid")?, checkpoint.number_in("shrinkage", 0.0..=1.0)?);
         }
         if let Some(trainer) = &mut self.trainer {
             trainer.restore(&checkpoint)?;

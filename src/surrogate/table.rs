@@ -140,7 +140,7 @@ impl Table {
     /// The table with the values of a checkpoint.
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
-        let values = Arc::new(checkpoint.values("table.values", self.nodes.iter().product())?);
+        let values = Arc::new(checkpoint.finite_values("table.values", self.nodes.iter().product())?);
         Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values, not_finite: checkpoint.number("table.not_finite")? })
     }
 }

@@ -16,7 +16,7 @@ pub use client::Limits;
 pub use message::Keep;
 pub use parse::{Fault, Incoming, Parser};
 pub use socket::{Counts, PubSocket};
-pub use subscriber::{SubscribeError, Subscriber};
+pub use subscriber::{Stream, SubscribeError, Subscriber};
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

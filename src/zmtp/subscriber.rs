@@ -43,7 +43,8 @@ pub enum SubscribeError {
     System(#[from] io::Error),
 }
 
-trait Stream: AsyncRead + AsyncWrite + Send + Unpin {}
+/// Bytes to and from a publisher.
+pub trait Stream: AsyncRead + AsyncWrite + Send + Unpin {}
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Stream for T {}
 
 /// A connection to a publisher. It is not restored when it ends.
@@ -66,11 +67,19 @@ impl Subscriber {
                 Place::Unix(path) => Box::new(UnixStream::connect(path).await?),
                 Place::Tcp(address, port) => Box::new(TcpStream::connect((address, port)).await?),
             };
-            let mut subscriber = Self { stream, buffer: BytesMut::new(), parts: Vec::new(), most };
-            subscriber.shake_hands(topics).await?;
-            Ok(subscriber)
+            Self::over(stream, topics, most).await
         });
         connected.await.unwrap_or_else(|_| Err(io::Error::from(ErrorKind::TimedOut).into()))
+    }
+
+    /// Greets and subscribes over a connection that exists, without a limit of time.
+    ///
+    /// # Errors
+    /// A peer that is no publisher, or an error of the system.
+    pub async fn over(stream: Box<dyn Stream>, topics: &[&str], most: usize) -> Result<Self, SubscribeError> {
+        let mut subscriber = Self { stream, buffer: BytesMut::new(), parts: Vec::new(), most };
+        subscriber.shake_hands(topics).await?;
+        Ok(subscriber)
     }
 
     async fn shake_hands(&mut self, topics: &[&str]) -> Result<(), SubscribeError> {

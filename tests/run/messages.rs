@@ -5,6 +5,7 @@ use crate::kit::program::{Outcome, config, records, run, summary};
 use crate::kit::scene::{self, scene};
 use crate::{in_folder, picture};
 use ridgewatch::surrogate::network::{Architecture, NetworkSettings};
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
@@ -184,4 +185,25 @@ fn lost_pictures_are_a_failure() {
     // Without EXR files, everything that was asked for exists.
     let (status, said) = replay("--set publish.exr=none");
     assert!(status == Some(0) && said.contains("frames in run/frames"), "{status:?} {said}");
+}
+
+/// In a folder that others could prepare, an archive replaces links instead of writing to where they lead, and is not written where all users may write.
+#[test]
+fn a_synthetic_archive_follows_no_links() {
+    let folder = tempfile::tempdir().unwrap();
+    let precious = folder.path().join("precious");
+    std::fs::write(&precious, "precious").unwrap();
+    for (shape, file) in [("ecmwf", "ecmwf_0000.nc"), ("flame", "flame_0000.h5")] {
+        let out = folder.path().join(shape);
+        std::fs::create_dir(&out).unwrap();
+        for link in [file.to_owned(), format!(".{file}.part")] {
+            std::os::unix::fs::symlink(&precious, out.join(link)).unwrap();
+        }
+        let arguments = ["synthesize", shape, "--out", shape, "--nodes", "8x8x8", "--snapshots", "2"];
+        succeeds(folder.path(), &arguments);
+        assert_eq!(std::fs::read_to_string(&precious).unwrap(), "precious");
+        succeeds(folder.path(), &["inspect", shape]);
+        std::fs::set_permissions(&out, std::fs::Permissions::from_mode(0o777)).unwrap();
+        ridgewatch(folder.path(), &arguments).refused(1, &["has mode 0777", "into which not all users may write"]);
+    }
 }

@@ -5,9 +5,12 @@ use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
 use crate::formats::{Attribute, Listing, NewVariable, NumberType, Values, write_hdf5, write_netcdf};
 use crate::grids::{AxisPlan, Quantity, VelocityScale, to_heights};
+use ridgewatch_base::folder::Folder;
 use ridgewatch_base::setting::word;
 use ridgewatch_field::turbulence::Turbulence;
 use ridgewatch_field::{Axis, AxisFault, EARTH_RADIUS};
+use std::error::Error;
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 
 /// Seconds between snapshots of the longitude-latitude shapes.
@@ -103,10 +106,10 @@ pub fn synthesized(settings: &SyntheticSettings) -> Result<PathBuf, SourceError>
     Ok(folder)
 }
 
-/// Writes an archive into an existing folder. Returns its files.
+/// Writes an archive into an existing folder. Returns its files. Links of their names are replaced, not followed.
 ///
 /// # Errors
-/// Settings out of range; a file that cannot be written.
+/// Settings out of range; a folder into which other users may write; a file that cannot be written.
 pub fn synthesize(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let fault = |key, found: String, accepted: &str| Err(SourceError::setting(key, found, accepted));
     let nodes = settings.nodes.iter().try_fold(1usize, |n, &k| n.checked_mul(k)).unwrap_or(usize::MAX);
@@ -125,20 +128,30 @@ pub fn synthesize(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<Pat
     if !(settings.amplitude.is_finite() && settings.amplitude > 0.0) {
         return fault("synthetic.amplitude", settings.amplitude.to_string(), "a number above 0");
     }
+    let checked = Folder::open(folder).and_then(|opened| opened.check_owner().map(|()| opened));
+    let folder = checked.map_err(|error| SourceError::write(folder, error))?;
     match settings.shape {
-        SyntheticShape::Flame => flame(settings, folder),
-        SyntheticShape::Ecmwf | SyntheticShape::Globe => ecmwf(settings, folder),
+        SyntheticShape::Flame => flame(settings, &folder),
+        SyntheticShape::Ecmwf | SyntheticShape::Globe => ecmwf(settings, &folder),
     }
 }
 
-fn flame(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
+/// Writes a file through a library that takes a path. Returns the file.
+fn write(folder: &Folder, name: &str, by_path: impl FnOnce(&Path) -> Result<(), Box<dyn Error>>) -> Result<PathBuf, SourceError> {
+    let path = folder.path().join(name);
+    // The path of the open file, so that the library opens this file and no other.
+    let written = folder.write_with(name, |file| by_path(Path::new(&format!("/proc/self/fd/{}", file.as_raw_fd()))));
+    written.map_err(|error| SourceError::write(&path, error))?;
+    Ok(path)
+}
+
+fn flame(settings: &SyntheticSettings, folder: &Folder) -> Result<Vec<PathBuf>, SourceError> {
     let [nx, ny, nz] = settings.nodes;
-    let grid = Turbulence::grid(settings.nodes).map_err(|fault| SourceError::file(folder, fault))?;
+    let grid = Turbulence::grid(settings.nodes).map_err(|fault| SourceError::file(folder.path(), fault))?;
     let turbulence = turbulence(settings, settings.nodes);
     let what = format!("{WRITTEN_HERE}{}", settings.described());
     let mut files = Vec::new();
     for index in 0..settings.snapshots {
-        let path = folder.join(format!("flame_{index:04}.h5"));
         let snapshot = turbulence.snapshot(index as f64, &grid);
         let dataset = |name, dimensions, values| NewVariable { name, dimensions, attributes: Vec::new(), values };
         let mut datasets = Vec::new();
@@ -149,8 +162,8 @@ fn flame(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
         for (axis, name) in grid.axes.iter().zip(["x", "y", "z"]) {
             datasets.push(dataset(name, vec![(name, axis.len())], Values::Float64(axis.coordinates().to_vec())));
         }
-        write_hdf5(&path, ("time", index as f64), (SOURCE, what.as_str()), datasets).map_err(|e| SourceError::write(&path, e))?;
-        files.push(path);
+        let hdf5 = |path: &Path| write_hdf5(path, ("time", index as f64), (SOURCE, what.as_str()), datasets);
+        files.push(write(folder, &format!("flame_{index:04}.h5"), hdf5)?);
     }
     Ok(files)
 }
@@ -173,8 +186,8 @@ fn globe_axes(nodes: [usize; 3]) -> Result<[AxisPlan; 3], AxisFault> {
     ])
 }
 
-fn ecmwf(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
-    let fault = |fault| SourceError::file(folder, fault);
+fn ecmwf(settings: &SyntheticSettings, folder: &Folder) -> Result<Vec<PathBuf>, SourceError> {
+    let fault = |fault| SourceError::file(folder.path(), fault);
     let axes = globe_axes(settings.nodes).map_err(fault)?;
     let (level, factors) = to_heights(axes[2].clone(), 1.0).map_err(fault)?;
     let [nx, ny, nz] = settings.nodes;
@@ -224,10 +237,8 @@ fn ecmwf(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
                 }
             }
         }
-        let path = folder.join(format!("ecmwf_{index:04}.nc"));
         let variables = ecmwf_variables(&coordinates, &components, time * 24.0);
-        write_netcdf(&path, &attributes, &variables).map_err(|e| SourceError::write(&path, e))?;
-        files.push(path);
+        files.push(write(folder, &format!("ecmwf_{index:04}.nc"), |path| write_netcdf(path, &attributes, &variables))?);
     }
     Ok(files)
 }

@@ -140,18 +140,19 @@ impl<T: Training> Trainer<T> {
         let progress = Progress {
             drawn: checkpoint.number("network.drawn")?,
             averaged: checkpoint.number("network.averaged")?,
-            stall: checkpoint.number("network.stall")?,
-            caution: checkpoint.number("network.caution")?,
-            first_loss: checkpoint.number("network.first_loss")?,
-            smooth: checkpoint.number("network.smooth")?,
-            looked: checkpoint.number("network.looked")?,
+            stall: checkpoint.number_in("network.stall", 0.0..=1.0)?,
+            caution: checkpoint.number_in("network.caution", 0.0..=1.0)?,
+            first_loss: checkpoint.number_in("network.first_loss", 0.0..=f64::MAX)?,
+            smooth: checkpoint.number_in("network.smooth", 0.0..=f64::MAX)?,
+            looked: checkpoint.number_in("network.looked", 0.0..=f64::MAX)?,
         };
         let standardised = checkpoint.number("network.standardised")?;
         let steps = checkpoint.number("network.steps")?;
         let mut scale = self.objective.scale;
         for output in 0..3 {
             scale.mean[output] = checkpoint.finite(&format!("network.mean.{output}"))?;
-            scale.deviation[output] = checkpoint.finite(&format!("network.deviation.{output}"))?;
+            // The loss divides by it.
+            scale.deviation[output] = checkpoint.number_in(&format!("network.deviation.{output}"), f32::MIN_POSITIVE..=f32::MAX)?;
         }
         let shape = self.training.shape();
         let read = |name: &str, len: usize| -> Result<[Vec<f32>; 3], CheckpointError> {
