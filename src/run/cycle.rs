@@ -9,7 +9,7 @@ use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
-use super::steps::picture_steps;
+use super::steps::{PictureSteps, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
@@ -17,7 +17,7 @@ use super::{ColorBar, RunError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
-use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{CheckpointError, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
@@ -81,7 +81,7 @@ pub struct RunReport {
     pub worked: f64,
     /// Optimizer steps.
     pub train_steps: u64,
-    /// Runge-Kutta steps per path; `None` if each path chooses its own steps, or if there was no tracer yet.
+    /// Runge-Kutta steps per path in the last slide; `None` if each path chooses its own steps, or if there was no tracer yet.
     pub integration_steps: Option<usize>,
     /// Difference of the log-stretch from that of at least twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
@@ -208,8 +208,10 @@ impl Recovering for Run<'_> {
 pub(super) struct Cycle<'a, B: Backend> {
     pub(super) run: Run<'a>,
     pub(super) session: Session<B>,
-    /// Flow map with the number of steps of the first slide, so that frames are comparable.
+    /// Flow map with its number of steps: that of the first slide, so that frames are comparable, unless the picture decides on it.
     pub(super) map: FlowMap,
+    /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
+    settled: Option<(StepChoice, PictureSteps)>,
 }
 
 /// Place of a frame in its slide.
@@ -299,7 +301,7 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
-    let mut cycle = Cycle { run, session, map };
+    let mut cycle = Cycle { run, session, map, settled: None };
     cycle.run.report.integration_difference = chosen.map(|c| c.difference).filter(|difference| difference.is_finite());
     slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen));
     cycle.settle_steps(&slide, chosen)?;
@@ -406,18 +408,50 @@ impl<'a> Run<'a> {
 }
 
 impl<B: Backend> Cycle<'_, B> {
-    /// Replaces the flow map of the first slide by one with the steps of the picture.
+    /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer.
     fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
         let Run { plan, threads, renderer, .. } = &self.run;
-        let Some(settled) = threads.render().install(|| picture_steps(plan, slide, renderer.transfer(), chosen))? else { return Ok(()) };
-        tracing::info!("{settled:?} instead of {chosen:?}");
-        self.map.steps = Steps::Fixed(settled.steps);
-        transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
-        let report = &mut self.run.report;
-        report.integration_steps = Some(settled.steps);
-        report.integration_difference = Some(settled.difference).filter(|difference| difference.is_finite());
-        report.integration_residual = Some(settled.residual);
+        let Some(chosen) = chosen.filter(|choice| choice.within_tolerance && suit_the_picture(plan)) else { return Ok(()) };
+        let settled = threads.render().install(|| picture_steps(plan, slide, renderer.transfer(), chosen))?;
+        self.settled = settled.map(|settled| (chosen, settled));
+        if let Some(settled) = settled.filter(|settled| settled.steps < chosen.steps) {
+            tracing::info!("{settled:?} instead of {chosen:?}");
+            self.take_steps(chosen, Some(settled));
+            transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        }
         Ok(())
+    }
+
+    /// Chooses the steps anew if they do not suit the picture of this slide.
+    fn look_at_steps(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        let Some((chosen, settled)) = self.settled else { return Ok(()) };
+        let Run { plan, threads, renderer, .. } = &self.run;
+        let begin = Instant::now();
+        let anew = threads.render().install(|| {
+            if !is_outdated(plan, slide, renderer.transfer(), chosen, settled)? {
+                return Ok(None);
+            }
+            let Some(anew) = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?.step_choice() else { return Ok(None) };
+            let settled = picture_steps(plan, slide, renderer.transfer(), anew)?;
+            Ok::<_, FlowError>(settled.map(|settled| (anew, settled)))
+        })?;
+        tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
+        if let Some((chosen, settled)) = anew {
+            tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
+            self.settled = Some((chosen, settled));
+            self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps && chosen.within_tolerance));
+        }
+        Ok(())
+    }
+
+    /// Takes the steps of the picture, or else those of the log-stretch.
+    fn take_steps(&mut self, chosen: StepChoice, settled: Option<PictureSteps>) {
+        let (steps, difference) = settled.map_or((chosen.steps, chosen.difference), |settled| (settled.steps, settled.difference));
+        self.map.steps = Steps::Fixed(steps);
+        let report = &mut self.run.report;
+        report.integration_steps = Some(steps);
+        report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
+        report.integration_residual = settled.map(|settled| settled.residual);
     }
 
     /// Renders all slides. The preparation of the first one began at `begun`.
@@ -483,6 +517,7 @@ impl<B: Backend> Cycle<'_, B> {
     /// Moves the session to the next window: tables are traced again, weights are kept, and trust starts again from nothing. Old labels are tested
     /// (unless the network has the start time as an input).
     fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        self.look_at_steps(slide)?;
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
         let rebuilds = self.run.learning.resize.is_some();

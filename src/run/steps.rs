@@ -3,17 +3,21 @@
 use super::setup::Plan;
 use super::slides::Slide;
 use crate::backend::stratified_points;
-use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, cpu_tracer};
+use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
 use crate::render::Transfer;
 use crate::trust::Strata;
+use std::ops::RangeInclusive;
 
 /// Largest optical residual of the steps, as a part of `trust.tolerance`, in flows of three dimensions, whose errors average along a ray: pictures of
 /// turbulence differ by 57 dB then (`docs/accuracy.md`).
 const SHARE: f64 = 2.0 / 3.0;
 /// The same in two dimensions, where a ray sees one value: a residual of 0.007 left a picture 40 dB.
 const FLAT_SHARE: f64 = 1.0 / 15.0;
-/// Smallest number of points on which something is to be seen.
-const MIN_SHOWN: usize = 64;
+/// Smallest share of the points on which something is to be seen.
+const MIN_SHOWN: f64 = 1.0 / 32.0;
+/// The residual at which steps are chosen again on a later slide, in units of the largest one of a choice: at more, pictures suffer, and at less,
+/// half the steps would do (the error of RK4 falls with their fourth power). The margins keep noise from choosing anew.
+const AGAIN: RangeInclusive<f64> = 0.01..=1.5;
 /// Random stream of the points on which steps are compared.
 const STREAM: u64 = u64::MAX - 1;
 
@@ -27,9 +31,9 @@ pub(super) struct PictureSteps {
     pub(super) residual: f64,
 }
 
-/// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most [`SHARE`]
-/// or [`FLAT_SHARE`] of the tolerance. `None` if there is none below those `chosen` for the log-stretch, if the method or the scene asks for these, or if too few points
-/// show anything to judge by.
+/// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
+/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance, or those `chosen` for the log-stretch if it has none below them. `None` if too few points show anything
+/// to judge by.
 ///
 /// # Errors
 /// As for [`cpu_tracer`].
@@ -37,46 +41,106 @@ pub(super) fn picture_steps(
     plan: &Plan,
     slide: &Slide,
     transfer: &Transfer,
-    chosen: Option<StepChoice>,
+    chosen: StepChoice,
 ) -> Result<Option<PictureSteps>, FlowError> {
-    let scene = &plan.scene;
-    let is_open = scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth();
-    let Some(chosen) = chosen.filter(|choice| is_open && choice.within_tolerance) else { return Ok(None) };
-    let (share, cells) = if plan.domain.dimensions == 3 { (SHARE, [16, 16, 8]) } else { (FLAT_SHARE, [64, 32, 1]) };
-    // Not the seed of the picture, which would change the flow map.
-    let unit = stratified_points(&Strata::even(cells, 1), 0, STREAM);
-    let mut points: Vec<[f32; 3]> = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
-    // In double precision, as the steps of the log-stretch are chosen.
-    let tracer = |steps: usize| {
-        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..plan.map.clone() };
-        cpu_tracer(slide.velocity.clone(), &map, slide.time)
-    };
-    let reference = tracer(2 * chosen.steps)?;
-    points.retain(|&point| !reference.is_missing(point));
-    let (mut truth, mut traced) = (Traced::default(), Traced::default());
-    reference.trace(&points, Extras::default(), &mut truth);
-    let ramp = |s: f32| f64::from(transfer.ramp(s / plan.map.tau as f32));
-    if truth.log_stretch.iter().filter(|&&s| ramp(s) > 0.0).count() < MIN_SHOWN {
-        return Ok(None);
-    }
+    let cells = if plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
+    let Some(comparison) = Comparison::new(plan, slide, transfer, cells, 0, 2 * chosen.steps)? else { return Ok(None) };
     let mut multiple = 1;
     while multiple * chosen.multiple_of < chosen.steps {
-        let steps = multiple * chosen.multiple_of;
-        tracer(steps)?.trace(&points, Extras::default(), &mut traced);
-        let pairs = || traced.log_stretch.iter().copied().zip(truth.log_stretch.iter().copied());
+        let found = comparison.of(multiple * chosen.multiple_of)?;
+        if found.residual <= most(plan) {
+            return Ok(Some(found));
+        }
+        multiple = (multiple + 1).max(multiple * 5 / 4);
+    }
+    comparison.of(chosen.steps).map(Some)
+}
+
+/// Whether steps that were `settled` for an earlier slide suit the picture of this one no more: its flow may be faster, or calmer. `chosen` was the
+/// choice for the log-stretch.
+///
+/// # Errors
+/// As for [`cpu_tracer`].
+pub(super) fn is_outdated(
+    plan: &Plan,
+    slide: &Slide,
+    transfer: &Transfer,
+    chosen: StepChoice,
+    settled: PictureSteps,
+) -> Result<bool, FlowError> {
+    // A quarter of the points of a choice, and others on each slide.
+    let cells = if plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
+    let Some(comparison) = Comparison::new(plan, slide, transfer, cells, slide.index, 2 * chosen.steps)? else { return Ok(false) };
+    let share = comparison.of(settled.steps)?.residual / most(plan).max(settled.residual);
+    let is_least = settled.steps <= chosen.multiple_of;
+    Ok(share > *AGAIN.end() || share < *AGAIN.start() && !is_least)
+}
+
+/// Whether the scene leaves the number of steps to the picture.
+pub(super) fn suit_the_picture(plan: &Plan) -> bool {
+    let scene = &plan.scene;
+    scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth()
+}
+
+/// The largest optical residual.
+fn most(plan: &Plan) -> f64 {
+    plan.scene.trust.tolerance * if plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
+}
+
+/// Points of a slide, and their log-stretch with many steps.
+struct Comparison<'a> {
+    plan: &'a Plan,
+    slide: &'a Slide,
+    transfer: &'a Transfer,
+    points: Vec<[f32; 3]>,
+    truth: Traced,
+}
+
+impl<'a> Comparison<'a> {
+    /// One point in each of the `cells` of the domain. `None` if too few of them show anything.
+    fn new(
+        plan: &'a Plan,
+        slide: &'a Slide,
+        transfer: &'a Transfer,
+        cells: [usize; 3],
+        number: u64,
+        steps: usize,
+    ) -> Result<Option<Self>, FlowError> {
+        // Not the seed of the picture, which would change the flow map.
+        let unit = stratified_points(&Strata::even(cells, 1), number, STREAM);
+        let points = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
+        let mut comparison = Self { plan, slide, transfer, points, truth: Traced::default() };
+        let reference = comparison.tracer(steps)?;
+        comparison.points.retain(|&point| !reference.is_missing(point));
+        reference.trace(&comparison.points, Extras::default(), &mut comparison.truth);
+        let shown = comparison.truth.log_stretch.iter().filter(|&&s| comparison.ramp(s) > 0.0).count();
+        let cells: usize = cells.iter().product();
+        Ok(Some(comparison).filter(|_| shown as f64 >= MIN_SHOWN * cells as f64))
+    }
+
+    /// In double precision, as the steps of the log-stretch are chosen.
+    fn tracer(&self, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
+        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.plan.map.clone() };
+        cpu_tracer(self.slide.velocity.clone(), &map, self.slide.time)
+    }
+
+    fn ramp(&self, log_stretch: f32) -> f64 {
+        f64::from(self.transfer.ramp(log_stretch / self.plan.map.tau as f32))
+    }
+
+    fn of(&self, steps: usize) -> Result<PictureSteps, FlowError> {
+        let mut traced = Traced::default();
+        self.tracer(steps)?.trace(&self.points, Extras::default(), &mut traced);
+        let pairs = || traced.log_stretch.iter().copied().zip(self.truth.log_stretch.iter().copied());
         let residual = upper_rms(pairs().map(|(a, b)| match (a.is_finite(), b.is_finite()) {
-            (true, true) => ramp(a) - ramp(b),
+            (true, true) => self.ramp(a) - self.ramp(b),
             (false, false) => 0.0,
             // The colours may differ as much as they can.
             _ => 1.0,
         }));
-        if residual <= share * scene.trust.tolerance {
-            let difference = upper_rms(pairs().map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
-            return Ok(Some(PictureSteps { steps, difference, residual }));
-        }
-        multiple = (multiple + 1).max(multiple * 5 / 4);
+        let difference = upper_rms(pairs().map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
+        Ok(PictureSteps { steps, difference, residual })
     }
-    Ok(None)
 }
 
 /// Root mean square, from the mean square and its standard error added up: few points hold most of a difference.

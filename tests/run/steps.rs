@@ -1,8 +1,9 @@
 //! The Runge-Kutta steps that a run chooses.
 
 use crate::kit::{flow::quasi_random, scene};
-use ridgewatch::flow::{Extras, FlowMap, Steps, Traced, cpu_tracer, dormand_prince_tracer};
-use ridgewatch::run::{RunOptions, RunReport, settled_colours};
+use ridgewatch::field::analytic::Analytic;
+use ridgewatch::flow::{Extras, FlowMap, Steps, Traced, VelocitySource, cpu_tracer, dormand_prince_tracer};
+use ridgewatch::run::{RunError, RunOptions, RunReport, Setup, Slide, Slides, settled_colours};
 use ridgewatch::trust::TrustSettings;
 use std::sync::atomic::AtomicBool;
 
@@ -62,4 +63,46 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
         let stated = found.integration_residual.unwrap();
         assert!((0.7..=1.5).contains(&(stated / rms)), "{kind}: {rms} with {steps} of {most} steps, stated {stated}");
     }
+}
+
+/// Slides of a double gyre that turns at another speed in each.
+struct Gusts {
+    first: Slide,
+    speeds: std::vec::IntoIter<f64>,
+}
+
+impl Slides for Gusts {
+    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {
+        let Some(speed) = self.speeds.next() else { return Ok(None) };
+        let VelocitySource::Analytic(_, domain) = self.first.velocity.clone() else { unreachable!("a closed form") };
+        let flow = Analytic::DoubleGyre { amplitude: speed, epsilon: 0.1, omega: std::f64::consts::TAU / 10.0 };
+        let slide = Slide { velocity: VelocitySource::Analytic(flow, domain), ..self.first.clone() };
+        self.first.index += 1;
+        Ok(Some(slide))
+    }
+
+    fn expected(&self) -> Option<u64> {
+        Some(self.speeds.len() as u64)
+    }
+}
+
+#[test]
+fn a_faster_flow_gets_more_steps_and_a_calm_one_fewer() {
+    let (kind, keys) = SCENES[1];
+    let text = scene::scene(kind, [16, 8, 1], &format!("{keys}\nrender.method = \"marched\"\nsurrogate.kind = \"table\""));
+    let speeds = vec![0.1, 0.1, 0.4, 0.4, 0.1];
+    let count = speeds.len();
+    let mut setup = scene::setup(&text, &[]);
+    let first = setup.slides.next_slide(&AtomicBool::new(false)).ok().flatten().unwrap();
+    let mut found = Vec::new();
+    scene::run_frames(Setup { slides: Box::new(Gusts { first, speeds: speeds.into_iter() }), ..setup }, &RunOptions::default(), |frame| {
+        found.push((frame.record.integration_steps.unwrap(), frame.record.integration_residual));
+    });
+    assert_eq!(found.len(), count);
+    assert_eq!(found[0], found[1], "nothing has changed");
+    assert!(found[2].0 > 2 * found[0].0, "{found:?}");
+    assert_eq!(found[2], found[3], "nothing has changed");
+    assert_eq!(found[4], found[0], "the flow is the first one again");
+    let most = TrustSettings::default().tolerance / 15.0;
+    assert!(found[2].1.is_some_and(|residual| residual <= most), "{found:?}");
 }
