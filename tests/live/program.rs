@@ -169,6 +169,8 @@ fn a_killed_simulation_and_a_killed_sidecar_are_survived() {
     // The next sidecar removes what both left.
     let out = end(place.attach(place.ring(), &place.file("sweep"), &[]));
     assert!(out.stderr.contains("stopped before a simulation came"), "{}", out.stderr);
+    // Half of the 15 s that `--stop-within` is by default.
+    assert!(out.stderr.contains("for 7.5 s at most"), "{}", out.stderr);
     assert!(!place.ring.0.exists(), "{:?}", std::fs::read_dir(&place.ring.0).map(|d| d.flatten().map(|e| e.path()).collect::<Vec<_>>()));
 }
 
