@@ -5,7 +5,7 @@
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and stay there. The
 //! time includes building the network, tracing (also of the labels that determine the scale) and training; it excludes the upload of the window,
 //! the compilation of kernels, and the measurement of the error. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
-//! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y and the start time; twice those of the published
+//! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y, the start time and the duration; twice those of the published
 //! tracing in `published`). `published` also compares pictures of what was traced, laid out in a table, or learned.
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
@@ -735,6 +735,97 @@ mod bench {
         }
         let (name, settings) = published_settings().next().ok_or("no network")?;
         learned(&format!("{name}, frequencies, as published"), &of_start(settings), PUBLISHED)?;
+        println!();
+        durations(&gpu, &space_time, seconds, |duration, per_unit, precision| {
+            let steps = (per_unit * duration).ceil() as usize;
+            DeviceTracer::with_starts(&gpu, &flow, &plane, &FlowMap { tau: duration, ..map(steps, precision) }, steps)
+        })
+    }
+
+    /// The double gyre over x, y, the start time and the duration in (0, 10]: a network of four inputs beside tables of four axes, whose last one is a
+    /// row of three-dimensional tables. `tracer` makes a tracer for a duration, with so many steps in a unit of time.
+    fn durations(
+        gpu: &Arc<Gpu>,
+        space_time: &Domain,
+        seconds: f64,
+        tracer: impl Fn(f64, f64, Precision) -> Result<DeviceTracer, DeviceError>,
+    ) -> Outcome<()> {
+        const LONGEST: f64 = 10.0;
+        const LABELS: f64 = 10.0;
+        const TESTS: usize = 32;
+        /// Durations of a round of labels.
+        const PARTS: usize = 16;
+        // A duration from each part of the range, anywhere in it; number by number they fill it evenly (the golden ratio).
+        let drawn = |part: usize, parts: usize, number: u64| {
+            (part as f64 + (number as f64 * 0.618_033_988_749_895).fract()) / parts as f64 * LONGEST
+        };
+        let drawer = drawer(gpu, space_time)?;
+        let mut tests = Vec::new();
+        for test in 0..TESTS {
+            let duration = drawn(test, TESTS, test as u64 + 1);
+            let (mut seeds, mut tested) = (Batch::new(gpu, TESTED / TESTS)?, Batch::new(gpu, TESTED / TESTS)?);
+            drawer.draw_points(space_time, 99, (test * TESTED) as u64, &mut seeds.points)?;
+            drawer.draw_points(&Domain::cuboid([0.0; 3], [1.0; 3]), 99, (test * TESTED) as u64, &mut tested.points)?;
+            let exact = tracer(duration, 100.0, Precision::F64)?;
+            seeds.trace(&exact)?;
+            tests.push((duration, tested, seeds.found()?));
+        }
+        let truth: Vec<f32> = tests.iter().flat_map(|(.., truth)| truth.iter().copied()).collect();
+
+        println!("<!-- block network-durations -->");
+        println!("| table over x, y, start and duration | MB | traced in, s | PSNR, dB |\n|---|---|---|---|");
+        for n in [22, 34, 54, 76, 108] {
+            let nodes = [2 * n, n, n];
+            let (mut found, mut traced) = (vec![vec![0.0f32; TESTED / TESTS]; TESTS], 0.0);
+            // At the duration 0 the log-stretch is 0.
+            for number in 1..n {
+                let tracer = tracer(LONGEST * number as f64 / (n - 1) as f64, LABELS, Precision::F32)?;
+                let mut table = DeviceTable::trace(&tracer, space_time, nodes)?;
+                let begin = gpu.mark()?;
+                table.retrace(&tracer)?;
+                traced += f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+                for ((duration, tested, _), found) in tests.iter().zip(&mut found) {
+                    let weight = 1.0 - (duration / LONGEST * (n - 1) as f64 - number as f64).abs() as f32;
+                    if weight > 0.0 {
+                        found.iter_mut().zip(tested.predict(&table)?).for_each(|(sum, value)| *sum += weight * value);
+                    }
+                }
+            }
+            let megabytes = 4e-6 * (nodes.iter().product::<usize>() * n) as f64;
+            println!("| [{}, {n}, {n}, {n}] | {megabytes:.0} | {traced:.3} | {:.1} |", 2 * n, psnr(&found.concat(), &truth));
+        }
+        println!();
+
+        println!("| network over x, y, start and duration | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|");
+        let labels = |batch: &Batch, number: u64| -> Outcome<Option<f32>> {
+            let duration = drawn((number % PARTS as u64) as usize, PARTS, number + 1);
+            let tracer = tracer(duration, LABELS, Precision::F32)?;
+            batch.trace(&tracer)?;
+            // The tracer's memory is freed here.
+            gpu.synchronize()?;
+            Ok(Some((duration / LONGEST) as f32))
+        };
+        let lesson = Lesson { gpu, domain: space_time, labels: &labels, parts: PARTS, base: None, seconds };
+        let range = Some([space_time.min[2], space_time.max[2]]);
+        let frequency = published_settings().map(|(name, settings)| (format!("{name}, frequencies, as published"), settings, PUBLISHED));
+        let hashes = [
+            ("8x2, growth 1.6, T = 2^16", hash(8, 2, 1.6, 16, 64)),
+            ("8x2, growth 2, T = 2^19", hash(8, 2, 2.0, 19, 64)),
+            ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
+        ];
+        let hashes = hashes.into_iter().map(|(name, settings)| (name.to_owned(), settings, HASH));
+        for (name, settings, pace) in hashes.chain(frequency.take(1)) {
+            let settings = NetworkSettings { inputs: vec![Input::Start, Input::Duration], start_range: range, ..settings };
+            let (learned, _) = lesson.learn(&settings, pace, |network| {
+                let mut found = Vec::with_capacity(TESTED);
+                for (duration, tested, _) in &tests {
+                    found.append(&mut tested.predict(&network.at([f32::NAN, (duration / LONGEST) as f32]))?);
+                }
+                Ok(psnr(&found, &truth))
+            })?;
+            println!("| {name} | {:.1} {}", learned.megabytes, learned.row());
+        }
         println!();
         Ok(())
     }
