@@ -1,11 +1,12 @@
 //! Measures the network on a GPU: rates of prediction and training, and its accuracy after some seconds of tracing and training from
 //! a new network. Prints blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
-//! [published-speed] [published] [seconds]`
+//! [published-speed] [published] [published-double-gyre] [published-globe] [published-flame] [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and stay there. The
 //! time includes building the network, tracing (also of the labels that determine the scale) and training; it excludes the upload of the window,
 //! the compilation of kernels, and the measurement of the error. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
-//! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y and the start time).
+//! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y, the start time and the duration; twice those of the published
+//! tracing in `published`). `published` also compares pictures of what was traced, laid out in a table, or learned.
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
 
@@ -36,8 +37,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     if asked("published-speed") {
         bench::published_speed()?;
     }
-    if asked("published") {
-        bench::published(seconds)?;
+    for dataset in &bench::DATASETS {
+        if asked("published") || told.iter().any(|t| t.strip_prefix("published-") == Some(dataset.name)) {
+            bench::published(dataset, seconds)?;
+        }
     }
     Ok(())
 }
@@ -45,21 +48,31 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 #[cfg(feature = "cuda")]
 mod bench {
     use ridgewatch::backend::cuda::{
-        Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
-        Outputs, SnapshotStore, Storage, Tuning,
+        Buffer, CudaTracer, DeviceError, DeviceNetwork, DevicePredict, DeviceQueryRouter, DeviceSamples, DeviceTable, DeviceTracer,
+        DeviceTraining, FrameQueries, Gpu, GpuRenderer, GpuSettings, NetworkAbove, Outputs, SnapshotStore, Storage, Tuning,
     };
+    use ridgewatch::config::SceneFile;
     use ridgewatch::field::Domain;
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
     use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
+    use ridgewatch::publish::compare_films;
+    use ridgewatch::render::{Film, Method, RenderStats, Renderer, Scene};
+    use ridgewatch::run::{Plan, Setup, Slide, settled_colours};
     use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale, Target};
+    use ridgewatch::trust::Gate;
     use std::error::Error;
+    use std::path::Path;
     use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
     use std::time::Instant;
 
     type Outcome<T> = Result<T, Box<dyn Error>>;
 
+    static NEVER: AtomicBool = AtomicBool::new(false);
     const ROUNDS: usize = 9;
+    /// Milliseconds from which three rounds are enough.
+    const LONG: f64 = 400.0;
 
     /// Median milliseconds of device time.
     fn time(gpu: &Gpu, mut work: impl FnMut() -> Result<(), DeviceError>) -> Result<f64, DeviceError> {
@@ -72,9 +85,12 @@ mod bench {
             if round > 0 {
                 times.push(milliseconds);
             }
+            if times.len() == 3 && milliseconds > LONG {
+                break;
+            }
         }
         times.sort_by(f64::total_cmp);
-        Ok(times[ROUNDS / 2])
+        Ok(times[times.len() / 2])
     }
 
     fn hash(levels: usize, features: usize, growth: f32, log2_table: u32, width: usize) -> NetworkSettings {
@@ -190,10 +206,14 @@ mod bench {
             unsafe { tracer.trace(self.points.address(), self.points.len(), &out) }
         }
 
-        /// By something that takes unit coordinates.
-        fn predict(&self, surrogate: &dyn DevicePredict) -> Result<Vec<f32>, DeviceError> {
+        /// Asks something that takes unit coordinates.
+        fn ask(&self, surrogate: &dyn DevicePredict) -> Result<(), DeviceError> {
             // SAFETY: both buffers hold as many entries.
-            unsafe { surrogate.predict(self.points.address(), self.points.len(), self.values.address()) }?;
+            unsafe { surrogate.predict(self.points.address(), self.points.len(), self.values.address()) }
+        }
+
+        fn predict(&self, surrogate: &dyn DevicePredict) -> Result<Vec<f32>, DeviceError> {
+            self.ask(surrogate)?;
             self.found()
         }
 
@@ -204,9 +224,11 @@ mod bench {
         }
     }
 
+    /// Points without a velocity have no exact value and do not count.
     fn psnr(found: &[f32], exact: &[f32]) -> f64 {
-        let peak = exact.iter().fold(0.0_f64, |m, &s| m.max(f64::from(s)));
-        let square = found.iter().zip(exact).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / exact.len() as f64;
+        let known: Vec<(f32, f32)> = found.iter().copied().zip(exact.iter().copied()).filter(|(_, exact)| exact.is_finite()).collect();
+        let peak = known.iter().fold(0.0_f64, |m, &(_, s)| m.max(f64::from(s)));
+        let square = known.iter().map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / known.len() as f64;
         20.0 * (peak / square.sqrt()).log10()
     }
 
@@ -243,8 +265,6 @@ mod bench {
     /// A field with its tracer, and points where it is known.
     struct Known {
         gpu: Arc<Gpu>,
-        source: VelocitySource,
-        store: SnapshotStore,
         tracer: CudaTracer,
         domain: Domain,
         steps: usize,
@@ -269,7 +289,7 @@ mod bench {
             let exact = CudaTracer::new(&store, &gpu, source.clone(), &map(220, Precision::F64), 0.0, Tuning::default())?;
             let domain = tracer.host().domain().clone();
             let points = KnownPoints::new(&gpu, &domain, tracer.device(), exact.device())?;
-            Ok(Self { gpu, source, store, tracer, domain, steps, points })
+            Ok(Self { gpu, tracer, domain, steps, points })
         }
     }
 
@@ -279,6 +299,9 @@ mod bench {
         batch: usize,
         rate: f64,
     }
+
+    const PUBLISHED: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
+    const HASH: Pace = Pace { batch: BATCH, rate: 1e-2 };
 
     /// The published networks.
     fn published_settings() -> impl Iterator<Item = (String, NetworkSettings)> {
@@ -357,53 +380,232 @@ mod bench {
         Ok(())
     }
 
-    /// The tables of the paper that the published networks are of, redone: what they and hash grids know after some seconds, what they predict and
-    /// train in a second, beside the published tracing and ours.
-    pub fn published(seconds: f64) -> Outcome<()> {
-        const PUBLISHED: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
-        const HASH: Pace = Pace { batch: BATCH, rate: 1e-2 };
-        let Known { gpu, source, store, tracer, domain, points: KnownPoints { seeds, tested, truth }, .. } = Known::new(Field::Easy, 0)?;
-        let megabytes = 12e-6 * (SHAPE.iter().product::<usize>() * SNAPSHOTS) as f64;
-        let drawer = drawer(&gpu, &domain)?;
-        println!("<!-- block network-published -->");
-        println!(
-            "| | MB | 2^18 samples, ms | M/s | trained, M/s, batch 2^18 | PSNR, dB, at once or after 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |"
-        );
-        println!("|{}", "---|".repeat(11));
-        let six = FlowMap { integrator: Integrator::Differences, difference_step: 1e-6, ..map(110, Precision::F64) };
-        let pairs = Tuning { storage: Storage::F16Pairs, ..Tuning::default() };
-        // The order that the published way traces in is that of its seeds, whose number then makes no difference.
+    /// A dataset of the paper that the published networks are of, or one of its shape.
+    pub struct Dataset {
+        pub name: &'static str,
+        scene: &'static str,
+        keys: &'static [&'static str],
+        /// Steps of the published tracing.
+        steps: usize,
+        /// Nodes of tables.
+        tables: [[usize; 3]; 2],
+    }
+
+    pub const DATASETS: [Dataset; 3] = [
+        Dataset {
+            name: "double-gyre",
+            scene: include_str!("../configs/double_gyre_mcftle.toml"),
+            keys: &["flow.steps=auto"],
+            steps: 400,
+            tables: [[256, 128, 1], [4096, 2048, 1]],
+        },
+        Dataset {
+            name: "globe",
+            scene: include_str!("../configs/globe.toml"),
+            // At the edges of the published domain particles move on along them.
+            keys: &["archive.synthetic.nodes=[360,181,37]", "flow.boundary=clamp"],
+            steps: 110,
+            tables: [[360, 181, 37], [719, 361, 73]],
+        },
+        Dataset {
+            name: "flame",
+            scene: include_str!("../configs/turbulence_easy.toml"),
+            keys: &["source.nodes=[600,192,192]"],
+            steps: 110,
+            tables: [SHAPE, [1199, 383, 383]],
+        },
+    ];
+
+    /// Pictures of one scene, all with the same random numbers and majorants.
+    struct Pictures {
+        device: GpuRenderer,
+        router: DeviceQueryRouter,
+        settled: Renderer,
+        samples: u32,
+        reference: Film,
+    }
+
+    impl Pictures {
+        fn new(gpu: &Arc<Gpu>, plan: &Plan, slide: &Slide, exact: &CudaTracer) -> Outcome<Self> {
+            /// Queries of a picture, about, and most samples a pixel.
+            const QUERIES: u64 = 1 << 27;
+            const MOST: u64 = 1024;
+            let settings = &plan.scene;
+            let (camera, light, transfer) = (settings.camera.clone(), settings.light.clone(), settings.transfer.clone());
+            let mut scene = Scene::assemble(&plan.domain, camera, light, transfer, settings.render.clone(), settings.seed);
+            scene.transfer = settled_colours(plan, exact, slide)?;
+            let settled = Renderer::new(scene, &plan.domain, plan.map.tau)?;
+            let (device, router) = (GpuRenderer::new(gpu)?, DeviceQueryRouter::new(gpu)?);
+            let mut pictures = Self { device, router, settled, samples: 1, reference: Film::default() };
+            let mut queries = 1;
+            for frame in 0..6 {
+                let mut renderer = pictures.settled.clone();
+                queries = pictures.render(&mut renderer, 1 << 40 | frame, exact, None)?.1.queries;
+                pictures.settled = renderer;
+            }
+            pictures.samples = (QUERIES / queries.max(1)).clamp(16, MOST) as u32;
+            let mut renderer = pictures.settled.clone();
+            pictures.reference = pictures.render(&mut renderer, 0, exact, None)?.0;
+            Ok(pictures)
+        }
+
+        /// Answers everything by `surrogate`, or traces everything.
+        fn render(
+            &mut self,
+            renderer: &mut Renderer,
+            number: u64,
+            tracer: &CudaTracer,
+            surrogate: Option<&dyn DevicePredict>,
+        ) -> Result<(Film, RenderStats), DeviceError> {
+            let everywhere = Gate::uniform(true);
+            let mut answers = self.router.begin(FrameQueries {
+                tracer: tracer.device(),
+                domain: tracer.host().domain(),
+                missing_cells: tracer.missing_cells(),
+                surrogate,
+                label_sink: None,
+                gate: &everywhere,
+                trace_budget: None,
+                keep: 0,
+                arrivals: false,
+            })?;
+            self.device.render_samples(renderer, number, 0..self.samples, &mut answers, None, &NEVER)
+        }
+
+        /// PSNR and SSIM, as cells of a table.
+        fn compared(&mut self, tracer: &CudaTracer, surrogate: Option<&dyn DevicePredict>) -> Outcome<String> {
+            let mut renderer = self.settled.clone();
+            let (film, _) = self.render(&mut renderer, 0, tracer, surrogate)?;
+            let found = compare_films(&film, &self.reference, renderer.scene().settings.tone_map)?;
+            Ok(format!("{:.1} | {:.4}", found.psnr.unwrap_or(f64::INFINITY), found.ssim.unwrap_or(f64::NAN)))
+        }
+    }
+
+    /// A method in the tables of the paper.
+    struct Row {
+        name: String,
+        /// Of what a sample may read; 0 for closed forms.
+        megabytes: f64,
+        /// Seconds of tracing the table or of training.
+        made_in: f64,
+        /// Milliseconds for 2^18 and 2^23 samples.
+        times: [f64; 2],
+        /// PSNR after a second of training.
+        early: Option<f64>,
+        psnr: f64,
+        picture: String,
+    }
+
+    /// Milliseconds for 2^18 and 2^23 random points of `domain`.
+    fn times(gpu: &Arc<Gpu>, domain: &Domain, answer: impl Fn(&Batch) -> Result<(), DeviceError>) -> Outcome<[f64; 2]> {
+        let drawer = drawer(gpu, domain)?;
+        let of = |count| -> Outcome<f64> {
+            let mut batch = Batch::new(gpu, count)?;
+            drawer.draw_points(domain, 3, 0, &mut batch.points)?;
+            Ok(time(gpu, || answer(&batch))?)
+        };
+        Ok([of(FEW)?, of(1 << 23)?])
+    }
+
+    /// The tables of the paper, redone on a dataset.
+    pub fn published(dataset: &Dataset, seconds: f64) -> Outcome<()> {
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+        let keys: Vec<String> = dataset.keys.iter().map(|&key| key.to_owned()).collect();
+        let mut settings = SceneFile::parse(Path::new(dataset.name), dataset.scene, &keys)?.settings();
+        settings.render.method = Method::Reference;
+        (settings.render.width, settings.render.height) = (320, 160);
+        let Setup { plan, mut slides, .. } = Setup::new(settings)?;
+        let slide = slides.next_slide(&NEVER)?.ok_or("no slide")?;
+        let (domain, store) = (&plan.domain, SnapshotStore::new(&gpu));
+        let tracer_of = |map: &FlowMap, tuning| CudaTracer::new(&store, &gpu, slide.velocity.clone(), map, slide.time, tuning);
+        let fixed = |steps, precision| FlowMap { steps: Steps::Fixed(steps), precision, ..plan.map.clone() };
+        let (ours, pairs) = (Tuning::default(), Tuning { storage: Storage::F16Pairs, ..Tuning::default() });
+        let tracer = tracer_of(&plan.map, ours)?;
+        let exact = tracer_of(&fixed(2 * dataset.steps, Precision::F64), ours)?;
+        let KnownPoints { seeds, tested, truth } = KnownPoints::new(&gpu, domain, tracer.device(), exact.device())?;
+        // In single precision: the picture is that of millions of samples.
+        let exact = tracer_of(&fixed(2 * dataset.steps, Precision::F32), ours)?;
+        let mut pictures = Pictures::new(&gpu, &plan, &slide, &exact)?;
+        let nodes = match &slide.velocity {
+            VelocitySource::Window(window) => window.grid().map_or(0, |grid| grid.nodes()) * window.snapshots().count(),
+            VelocitySource::Analytic(..) => 0,
+        };
+
+        let mut rows = Vec::new();
+        // The order that the published way traces in is that of its seeds.
         let as_they_come = Tuning { sorted: false, keep: false, spread: false, ..Tuning::default() };
-        for (name, map, tuning, many) in [
-            ("traced as published: six particles, f64, 110 steps", six, as_they_come, FEW),
-            ("traced: tangent, f32, 22 steps", map(22, Precision::F32), Tuning::default(), MANY),
-            ("traced: tangent, f32, 11 steps, window of f16 in pairs", map(11, Precision::F32), pairs, MANY),
+        let particles = FlowMap { integrator: Integrator::Differences, difference_step: 1e-6, ..fixed(dataset.steps, Precision::F64) };
+        let (steps, number) = (tracer.host().steps(), 2 * domain.dimensions);
+        for (name, map, tuning) in [
+            (format!("traced as published: {number} particles, f64, {} steps", dataset.steps), &particles, as_they_come),
+            (format!("traced: tangent, f32, {steps} steps"), &plan.map, ours),
+            (format!("traced: tangent, f32, {steps} steps, window of f16 in pairs"), &plan.map, pairs),
         ] {
-            let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, 0.0, tuning)?;
-            let milliseconds = |count| -> Outcome<f64> {
-                let mut batch = Batch::new(&gpu, count)?;
-                drawer.draw_points(&domain, 3, 0, &mut batch.points)?;
-                Ok(time(&gpu, || batch.trace(tracer.device()))?)
-            };
-            let (few, large) = (milliseconds(FEW)?, milliseconds(many)?);
+            if nodes == 0 && tuning.storage == Storage::F16Pairs {
+                continue;
+            }
+            let tracer = tracer_of(map, tuning)?;
+            let times = times(&gpu, domain, |batch| batch.trace(tracer.device()))?;
             seeds.trace(tracer.device())?;
-            let rate = many as f64 / large * 1e-3;
-            println!("| {name} | {megabytes:.0} | {few:.2} | {rate:.1} | - | {:.1} | - | - | - | - | - |", psnr(&seeds.found()?, &truth));
+            // A picture traced in the published way takes as long as all the others.
+            let picture = if map == &particles { "- | -".to_owned() } else { pictures.compared(&tracer, None)? };
+            let megabytes = 1e-6 * (nodes as u64 * tuning.storage.bytes()) as f64;
+            rows.push(Row { name, megabytes, made_in: 0.0, times, early: None, psnr: psnr(&seeds.found()?, &truth), picture });
+        }
+        let fastest_tracing = rows.iter().map(|row| row.times[1]).fold(f64::INFINITY, f64::min);
+        for nodes in dataset.tables {
+            let mut table = DeviceTable::trace(tracer.device(), domain, nodes)?;
+            let begin = gpu.mark()?;
+            table.retrace(tracer.device())?;
+            let made_in = f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+            rows.push(Row {
+                name: format!("table of {:?} nodes", &nodes[..domain.dimensions]),
+                megabytes: 4e-6 * table.nodes().iter().product::<usize>() as f64,
+                made_in,
+                times: times(&gpu, &unit, |batch| batch.ask(&table))?,
+                early: None,
+                psnr: psnr(&tested.predict(&table)?, &truth),
+                picture: pictures.compared(&tracer, Some(&table))?,
+            });
         }
         let hashes =
             [("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)), ("hash 4x4, growth 1.6, base 128, T = 2^24, 2x64", finest())];
-        let published = published_settings().map(|(name, settings)| (name, settings, PUBLISHED));
-        for (name, settings, pace) in published.chain(hashes.into_iter().map(|(name, settings)| (name.to_owned(), settings, HASH))) {
-            let Rates { few, predicted, trained } = rates(&gpu, &settings, pace.rate, &[FEW])?;
-            let learned = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, pace, seconds, |network| {
-                Ok(psnr(&tested.predict(network)?, &truth))
-            })?;
+        let networks = published_settings().map(|(name, settings)| (name, settings, PUBLISHED));
+        for (name, settings, pace) in networks.chain(hashes.map(|(name, settings)| (name.to_owned(), settings, HASH))) {
+            let lesson = Lesson { gpu: &gpu, domain, labels: &traced_by(tracer.device()), parts: 1, base: None, seconds };
+            let (learned, network) = lesson.learn(&settings, pace, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
+            rows.push(Row {
+                name,
+                megabytes: learned.megabytes,
+                made_in: seconds,
+                times: times(&gpu, &unit, |batch| batch.ask(&network))?,
+                early: learned.psnr.first().copied(),
+                psnr: learned.psnr.last().copied().unwrap_or(f64::NAN),
+                picture: pictures.compared(&tracer, Some(&network))?,
+            });
+        }
+
+        let render = &plan.scene.render;
+        println!("<!-- block network-published-{} -->", dataset.name);
+        println!(
+            "{}. tau {}; pictures of {}x{} pixels, {} samples each.\n",
+            plan.source, plan.map.tau, render.width, render.height, pictures.samples
+        );
+        println!(
+            "| | MB | made in, s | 2^18 samples, ms | 2^23 samples, ms | times the published tracing | times our best tracing | \
+             PSNR after 1 s, dB | PSNR, dB | picture: PSNR, dB | SSIM |"
+        );
+        println!("|{}", "---|".repeat(11));
+        for Row { name, megabytes, made_in, times: [few, many], early, psnr, picture } in &rows {
+            let or_none = |known: bool, text: String| if known { text } else { "-".to_owned() };
             println!(
-                "| {name} | {:.0} | {few:.2} | {:.1} | {:.1} {}",
-                learned.megabytes,
-                predicted * 1e-6,
-                trained[0] * 1e-6,
-                learned.row()
+                "| {name} | {} | {} | {few:.3} | {many:.2} | {:.1} | {:.2} | {} | {psnr:.1} | {picture} |",
+                or_none(*megabytes > 0.0, format!("{megabytes:.1}")),
+                or_none(*made_in > 0.0, format!("{made_in:.3}")),
+                rows[0].times[1] / many,
+                fastest_tracing / many,
+                early.map_or("-".to_owned(), |psnr| format!("{psnr:.1}"))
             );
         }
         println!();
@@ -411,7 +613,6 @@ mod bench {
     }
 
     pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
-        const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
         let Known { gpu, tracer, domain, steps, points: KnownPoints { seeds, tested, truth }, .. } = Known::new(field, 0)?;
         println!("<!-- block network-{name} -->");
         println!("Labels, traced with {steps} steps: {:.1} dB. Tables, by their nodes:\n", psnr(&seeds.found()?, &truth));
@@ -455,9 +656,9 @@ mod bench {
         ];
         for (kind, base, networks) in [("alone", None, alone), ("above the first table", Some(&table), above)] {
             for (name, settings) in networks {
-                let learned = learn(&gpu, &domain, tracer.device(), base, traced, &settings, PACE, seconds, |network| {
-                    Ok(psnr(&tested.predict(network)?, &truth))
-                })?;
+                let base = base.map(|table| (table, traced));
+                let lesson = Lesson { gpu: &gpu, domain: &domain, labels: &traced_by(tracer.device()), parts: 1, base, seconds };
+                let (learned, _) = lesson.learn(&settings, HASH, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
                 println!("| {kind} | {name} | {:.0} {}", learned.megabytes, learned.row());
             }
         }
@@ -484,7 +685,6 @@ mod bench {
 
     /// The double gyre over x, y and the start time in [0, 10], tau 10: a network with the start as an input, beside tables with an axis of starts.
     pub fn double_gyre(seconds: f64) -> Outcome<()> {
-        const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
         const LABEL_STEPS: usize = 100;
         const STARTS: [f64; 2] = [0.0, 10.0];
         let gpu = Gpu::open(0, &GpuSettings::default())?;
@@ -520,9 +720,8 @@ mod bench {
         println!("|---|---|---|---|---|---|---|---|");
         let of_start = |settings| NetworkSettings { inputs: vec![Input::Start], start_range: Some(STARTS), ..settings };
         let learned = |name: &str, settings: &NetworkSettings, pace: Pace| -> Outcome<()> {
-            let learned = learn(&gpu, &space_time, &tracer, None, 0.0, settings, pace, seconds, |network| {
-                Ok(psnr(&tested.predict(network)?, &truth))
-            })?;
+            let lesson = Lesson { gpu: &gpu, domain: &space_time, labels: &traced_by(&tracer), parts: 1, base: None, seconds };
+            let (learned, _) = lesson.learn(settings, pace, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
             println!("| {name} | {:.0} {}", learned.megabytes, learned.row());
             Ok(())
         };
@@ -532,10 +731,101 @@ mod bench {
             ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64)),
             ("4x4, growth 1.6, base 128, T = 2^24", finest()),
         ] {
-            learned(name, &of_start(settings), PACE)?;
+            learned(name, &of_start(settings), HASH)?;
         }
         let (name, settings) = published_settings().next().ok_or("no network")?;
-        learned(&format!("{name}, frequencies, as published"), &of_start(settings), Pace { batch: 1 << 16, rate: 1e-3 })?;
+        learned(&format!("{name}, frequencies, as published"), &of_start(settings), PUBLISHED)?;
+        println!();
+        durations(&gpu, &space_time, seconds, |duration, per_unit, precision| {
+            let steps = (per_unit * duration).ceil() as usize;
+            DeviceTracer::with_starts(&gpu, &flow, &plane, &FlowMap { tau: duration, ..map(steps, precision) }, steps)
+        })
+    }
+
+    /// The double gyre over x, y, the start time and the duration in (0, 10]: a network of four inputs beside tables of four axes, whose last one is a
+    /// row of three-dimensional tables. `tracer` makes a tracer for a duration, with so many steps in a unit of time.
+    fn durations(
+        gpu: &Arc<Gpu>,
+        space_time: &Domain,
+        seconds: f64,
+        tracer: impl Fn(f64, f64, Precision) -> Result<DeviceTracer, DeviceError>,
+    ) -> Outcome<()> {
+        const LONGEST: f64 = 10.0;
+        const LABELS: f64 = 10.0;
+        const TESTS: usize = 32;
+        /// Durations of a round of labels.
+        const PARTS: usize = 16;
+        // A duration from each part of the range, anywhere in it; number by number they fill it evenly (the golden ratio).
+        let drawn = |part: usize, parts: usize, number: u64| {
+            (part as f64 + (number as f64 * 0.618_033_988_749_895).fract()) / parts as f64 * LONGEST
+        };
+        let drawer = drawer(gpu, space_time)?;
+        let mut tests = Vec::new();
+        for test in 0..TESTS {
+            let duration = drawn(test, TESTS, test as u64 + 1);
+            let (mut seeds, mut tested) = (Batch::new(gpu, TESTED / TESTS)?, Batch::new(gpu, TESTED / TESTS)?);
+            drawer.draw_points(space_time, 99, (test * TESTED) as u64, &mut seeds.points)?;
+            drawer.draw_points(&Domain::cuboid([0.0; 3], [1.0; 3]), 99, (test * TESTED) as u64, &mut tested.points)?;
+            let exact = tracer(duration, 100.0, Precision::F64)?;
+            seeds.trace(&exact)?;
+            tests.push((duration, tested, seeds.found()?));
+        }
+        let truth: Vec<f32> = tests.iter().flat_map(|(.., truth)| truth.iter().copied()).collect();
+
+        println!("<!-- block network-durations -->");
+        println!("| table over x, y, start and duration | MB | traced in, s | PSNR, dB |\n|---|---|---|---|");
+        for n in [22, 34, 54, 76, 108] {
+            let nodes = [2 * n, n, n];
+            let (mut found, mut traced) = (vec![vec![0.0f32; TESTED / TESTS]; TESTS], 0.0);
+            // At the duration 0 the log-stretch is 0.
+            for number in 1..n {
+                let tracer = tracer(LONGEST * number as f64 / (n - 1) as f64, LABELS, Precision::F32)?;
+                let mut table = DeviceTable::trace(&tracer, space_time, nodes)?;
+                let begin = gpu.mark()?;
+                table.retrace(&tracer)?;
+                traced += f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+                for ((duration, tested, _), found) in tests.iter().zip(&mut found) {
+                    let weight = 1.0 - (duration / LONGEST * (n - 1) as f64 - number as f64).abs() as f32;
+                    if weight > 0.0 {
+                        found.iter_mut().zip(tested.predict(&table)?).for_each(|(sum, value)| *sum += weight * value);
+                    }
+                }
+            }
+            let megabytes = 4e-6 * (nodes.iter().product::<usize>() * n) as f64;
+            println!("| [{}, {n}, {n}, {n}] | {megabytes:.0} | {traced:.3} | {:.1} |", 2 * n, psnr(&found.concat(), &truth));
+        }
+        println!();
+
+        println!("| network over x, y, start and duration | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|");
+        let labels = |batch: &Batch, number: u64| -> Outcome<Option<f32>> {
+            let duration = drawn((number % PARTS as u64) as usize, PARTS, number + 1);
+            let tracer = tracer(duration, LABELS, Precision::F32)?;
+            batch.trace(&tracer)?;
+            // The tracer's memory is freed here.
+            gpu.synchronize()?;
+            Ok(Some((duration / LONGEST) as f32))
+        };
+        let lesson = Lesson { gpu, domain: space_time, labels: &labels, parts: PARTS, base: None, seconds };
+        let range = Some([space_time.min[2], space_time.max[2]]);
+        let frequency = published_settings().map(|(name, settings)| (format!("{name}, frequencies, as published"), settings, PUBLISHED));
+        let hashes = [
+            ("8x2, growth 1.6, T = 2^16", hash(8, 2, 1.6, 16, 64)),
+            ("8x2, growth 2, T = 2^19", hash(8, 2, 2.0, 19, 64)),
+            ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
+        ];
+        let hashes = hashes.into_iter().map(|(name, settings)| (name.to_owned(), settings, HASH));
+        for (name, settings, pace) in hashes.chain(frequency.take(1)) {
+            let settings = NetworkSettings { inputs: vec![Input::Start, Input::Duration], start_range: range, ..settings };
+            let (learned, _) = lesson.learn(&settings, pace, |network| {
+                let mut found = Vec::with_capacity(TESTED);
+                for (duration, tested, _) in &tests {
+                    found.append(&mut tested.predict(&network.at([f32::NAN, (duration / LONGEST) as f32]))?);
+                }
+                Ok(psnr(&found, &truth))
+            })?;
+            println!("| {name} | {:.1} {}", learned.megabytes, learned.row());
+        }
         println!();
         Ok(())
     }
@@ -560,80 +850,114 @@ mod bench {
         }
     }
 
-    /// Trains for some seconds. `before`: seconds that the clock starts at, where there is a table to be traced.
-    #[allow(clippy::too_many_arguments)] // An experiment has as many parameters.
-    fn learn(
-        gpu: &Arc<Gpu>,
-        domain: &Domain,
-        tracer: &DeviceTracer,
-        base: Option<&DeviceTable>,
-        before: f64,
-        settings: &NetworkSettings,
-        pace: Pace,
-        seconds: f64,
-        measure: impl Fn(&dyn DevicePredict) -> Outcome<f64>,
-    ) -> Outcome<Learned> {
-        const SCOUTS: usize = 1 << 14;
-        // The start time takes the third axis' place.
-        let axes = if settings.inputs.is_empty() { &[0, 1, 2][..] } else { &[0, 1] };
-        let shape = Architecture::new(settings, axes, domain.lengths())?;
-        let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
-        let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK)?, Batch::new(gpu, SCOUTS)?);
-        // The least network of the same inputs draws the points that tell how large the labels are.
-        let least = NetworkSettings { log2_table: 4, ..settings.clone() };
-        let least = Model::new(Architecture::new(&least, axes, domain.lengths())?, 1, base.is_some());
-        let scout = DeviceTraining::new(gpu, &least, &objective)?;
-        let mut pool = scout.replay_buffer(SCOUTS)?;
-        gpu.synchronize()?;
-        let start = Instant::now();
-        scout.draw_points(domain, 5, 0, &mut scouts.points)?;
-        scouts.trace(tracer)?;
-        // SAFETY: both buffers hold `SCOUTS` entries.
-        unsafe { scout.append(&mut pool, domain, scouts.points.address(), scouts.values.address(), SCOUTS, base)? };
-        objective.scale = scale(&pool, base.is_some())?;
-        let mut training = DeviceTraining::new(gpu, &Model::new(shape, 1, base.is_some()), &objective)?;
-        let mut buffer = training.replay_buffer(KEPT)?;
-        gpu.synchronize()?;
-        let mut clock = start.elapsed().as_secs_f64() + if base.is_some() { before } else { 0.0 };
-        drop((scout, pool, scouts));
+    /// Labels of a batch by a tracer.
+    fn traced_by(tracer: &DeviceTracer) -> impl Fn(&Batch, u64) -> Outcome<Option<f32>> {
+        |batch, _| Ok(batch.trace(tracer).map(|()| None)?)
+    }
 
-        let mut learned = Learned { megabytes: 0.0, psnr: Vec::new(), labels: 0, trained: 0 };
-        while clock < seconds && learned.psnr.len() < MARKS.len() {
-            let Learned { labels, trained, psnr, .. } = &mut learned;
-            let start = Instant::now();
-            training.draw_points(domain, 7, *labels, &mut chunk.points)?;
-            chunk.trace(tracer)?;
-            // SAFETY: both buffers hold `CHUNK` entries.
-            unsafe { training.append(&mut buffer, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
-            *labels += CHUNK as u64;
-            let done = training.steps();
-            let steps: Vec<PlannedStep> = (0..STEPS)
-                .map(|i| {
-                    // The mean runs over the last tenth of the steps.
-                    let number = done + i + 1;
-                    let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
-                    PlannedStep { average_share, ..step(pace.batch, *trained + (i * pace.batch) as u64, pace.rate) }
-                })
-                .collect();
-            training.train_steps(&buffer, None, &steps)?;
-            *trained += (STEPS * pace.batch) as u64;
-            clock += start.elapsed().as_secs_f64();
-            if clock >= MARKS[psnr.len()] {
-                let network = training.frozen()?;
-                psnr.push(measure(&network.above(base.map(|table| (table, 1.0))))?);
+    /// What a network is trained on, and for how long.
+    struct Lesson<'a> {
+        gpu: &'a Arc<Gpu>,
+        domain: &'a Domain,
+        /// Labels the batch with this number; returns its duration as a share of the longest, if that is an input.
+        labels: &'a dyn Fn(&Batch, u64) -> Outcome<Option<f32>>,
+        /// Batches of a round.
+        parts: usize,
+        /// The table that the network adds to, and the seconds that it was traced in.
+        base: Option<(&'a DeviceTable, f64)>,
+        seconds: f64,
+    }
+
+    impl Lesson<'_> {
+        /// Draws and labels the points of a batch, and appends them.
+        fn append(&self, training: &DeviceTraining, to: &mut DeviceSamples, batch: &mut Batch, seed: u64, number: u64) -> Outcome<()> {
+            let count = batch.points.len();
+            training.draw_points(self.domain, seed, number * count as u64, &mut batch.points)?;
+            let duration = (self.labels)(batch, number)?;
+            let (points, values, base) = (batch.points.address(), batch.values.address(), self.base.map(|(table, _)| table));
+            // SAFETY: both buffers hold `count` entries.
+            unsafe {
+                match duration {
+                    None => training.append(to, self.domain, points, values, count, base)?,
+                    // The points carry their start.
+                    Some(duration) => training.append_at(to, self.domain, [points, values], count, [f32::NAN, duration])?,
+                }
             }
+            Ok(())
         }
-        let table = base.map_or(0, |table| 4 * table.nodes().iter().product::<usize>());
-        learned.megabytes = (training.frozen()?.bytes() + table) as f64 * 1e-6;
-        Ok(learned)
+
+        fn learn(
+            &self,
+            settings: &NetworkSettings,
+            pace: Pace,
+            measure: impl Fn(NetworkAbove<'_>) -> Outcome<f64>,
+        ) -> Outcome<(Learned, DeviceNetwork)> {
+            const SCOUTS: usize = 1 << 14;
+            let Self { gpu, domain, parts, base, .. } = *self;
+            // The start time takes the third axis' place.
+            let axes = if settings.inputs.is_empty() { &[0, 1, 2][..domain.dimensions] } else { &[0, 1] };
+            let shape = Architecture::new(settings, axes, domain.lengths())?;
+            let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
+            let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK / parts)?, Batch::new(gpu, SCOUTS / parts)?);
+            // The least network of the same inputs draws the points that tell how large the labels are.
+            let least = NetworkSettings { log2_table: 4, ..settings.clone() };
+            let least = Model::new(Architecture::new(&least, axes, domain.lengths())?, 1, base.is_some());
+            let scout = DeviceTraining::new(gpu, &least, &objective)?;
+            let mut pool = scout.replay_buffer(SCOUTS)?;
+            gpu.synchronize()?;
+            let start = Instant::now();
+            for number in 0..parts as u64 {
+                self.append(&scout, &mut pool, &mut scouts, 5, number)?;
+            }
+            objective.scale = scale(&pool, base.is_some())?;
+            let mut training = DeviceTraining::new(gpu, &Model::new(shape, 1, base.is_some()), &objective)?;
+            let mut buffer = training.replay_buffer(KEPT)?;
+            gpu.synchronize()?;
+            let mut clock = start.elapsed().as_secs_f64() + base.map_or(0.0, |(_, seconds)| seconds);
+            drop((scout, pool, scouts));
+
+            let table = base.map(|(table, _)| (table, 1.0));
+            let mut learned = Learned { megabytes: 0.0, psnr: Vec::new(), labels: 0, trained: 0 };
+            while clock < self.seconds && learned.psnr.len() < MARKS.len() {
+                let Learned { labels, trained, psnr, .. } = &mut learned;
+                let start = Instant::now();
+                let first = *labels / (CHUNK / parts) as u64;
+                for number in first..first + parts as u64 {
+                    self.append(&training, &mut buffer, &mut chunk, 7, number)?;
+                }
+                *labels += CHUNK as u64;
+                let done = training.steps();
+                let steps: Vec<PlannedStep> = (0..STEPS)
+                    .map(|i| {
+                        // The mean runs over the last tenth of the steps.
+                        let number = done + i + 1;
+                        let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
+                        PlannedStep { average_share, ..step(pace.batch, *trained + (i * pace.batch) as u64, pace.rate) }
+                    })
+                    .collect();
+                training.train_steps(&buffer, None, &steps)?;
+                *trained += (STEPS * pace.batch) as u64;
+                clock += start.elapsed().as_secs_f64();
+                if clock >= MARKS[psnr.len()] {
+                    psnr.push(measure(training.frozen()?.above(table))?);
+                }
+            }
+            let network = training.frozen()?;
+            let table = base.map_or(0, |(table, _)| 4 * table.nodes().iter().product::<usize>());
+            learned.megabytes = (network.bytes() + table) as f64 * 1e-6;
+            Ok((learned, network))
+        }
     }
 
     /// Mean and deviation of the targets so far; a residual keeps the mean 0.
     fn scale(pool: &DeviceSamples, centred: bool) -> Outcome<Scale> {
         let values = pool.values()?;
-        let count = values.len() as f64;
-        let mean = if centred { 0.0 } else { values.iter().map(|v| f64::from(v[3])).sum::<f64>() / count };
-        let square = values.iter().map(|v| (f64::from(v[3]) - mean).powi(2)).sum::<f64>() / count;
+        // A further time is before the target, which then begins the second group of four numbers.
+        let groups = values.len() / pool.len();
+        let targets = || values.as_flattened().chunks_exact(4 * groups).map(|sample| f64::from(sample[groups + 2]));
+        let count = pool.len() as f64;
+        let mean = if centred { 0.0 } else { targets().sum::<f64>() / count };
+        let square = targets().map(|target| (target - mean).powi(2)).sum::<f64>() / count;
         Ok(Scale { mean: [mean as f32; 3], deviation: [square.sqrt() as f32; 3] })
     }
 }

@@ -414,6 +414,30 @@ impl DeviceTraining {
         unsafe { self.writer.append(buffer, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
     }
 
+    /// As [`Self::append`] without a table, for a label (log-stretch or arrival) at these unit times; a point carries times that are NaN.
+    ///
+    /// # Errors
+    /// Error of the driver.
+    ///
+    /// # Panics
+    /// If `count` exceeds the buffer's capacity.
+    ///
+    /// # Safety
+    /// As for [`Self::append`].
+    pub unsafe fn append_at(
+        &self,
+        buffer: &mut DeviceSamples,
+        domain: &Domain,
+        [points, labels]: [u64; 2],
+        count: usize,
+        times: [f32; 2],
+    ) -> Result<(), DeviceError> {
+        let capacity = buffer.capacity();
+        assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
+        // SAFETY: as required of the caller.
+        unsafe { self.writer.append(buffer, TracedBatch { domain, points, labels, count, base: None, times: Some(times), held_back: 0 }) }
+    }
+
     /// Fills `points` with uniform points of the domain, a function of `seed` and of their numbers from `first` on.
     ///
     /// # Errors
