@@ -1,6 +1,6 @@
 //! Compute backends: one trait for tracing, prediction, rendering, audits and training, with a CPU and a CUDA implementation.
 //!
-//! In: the velocity of a slide and the requests of `run`. Out: frames, audits, checkpoints. Uses `field`, `flow`, `surrogate`, `trust` and `render`.
+//! In: the velocity of a slide and the requests of `run`. Out: frames, audits, checkpoints. Uses `field`, `source`, `flow`, `surrogate`, `trust` and `render`.
 //! If a device fails, the call returns [`DeviceError`]. `run` then discards the frame and computes it again on the CPU.
 
 pub mod audit;
