@@ -162,6 +162,17 @@ where
     }
 }
 
+/// `text` of a scene, with the integration time that was chosen if the scene leaves it open: another trial, of more snapshots, may choose another one.
+pub fn text_with_tau(scene: &SceneFile, setup: &Setup, text: String) -> Result<String> {
+    let chosen = &setup.plan.scene.time.tau;
+    if &scene.time.tau == chosen {
+        return Ok(text);
+    }
+    let mut scene = scene.clone();
+    scene.time.tau.clone_from(chosen);
+    Ok(scene.to_toml()?)
+}
+
 /// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
 pub fn open(scene: &SceneFile) -> Result<Setup> {
     let _spinner = opening(scene);

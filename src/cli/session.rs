@@ -2,6 +2,7 @@
 
 use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
+    text_with_tau,
 };
 use super::signals::Stop;
 use super::{dashboard, messages, notify};
@@ -122,6 +123,7 @@ impl Session<'_> {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
+        let text = text_with_tau(&scene, &setup, text)?;
         let device = device(common, &scene)?;
         if let Some(checkpoint) = &options.checkpoint {
             check_folder(checkpoint)?;

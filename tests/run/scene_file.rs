@@ -158,6 +158,25 @@ fn a_run_is_made_again_from_its_own_scene() {
 }
 
 #[test]
+fn the_scene_of_a_run_has_the_integration_time_that_was_chosen() {
+    let folder = tempfile::tempdir().unwrap();
+    let succeeds = |arguments: &[&str]| ridgewatch(folder.path(), arguments).success();
+    succeeds(&["synthesize", "flame", "--out", "flame", "--nodes", "8x8x8", "--snapshots", "6"]);
+    let small = ["--set", "render.width=16", "--set", "render.height=8", "--set", "surrogate.kind=table"];
+    let said = succeeds(&[&["replay", "flame", "--out", "first"][..], &small].concat()).stderr;
+    let chosen = said.split("time.tau is not given: ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
+    let scene = std::fs::read_to_string(folder.path().join("first/scene.toml")).unwrap();
+    let document: toml_edit::DocumentMut = scene.parse().unwrap();
+    assert_eq!(document["time"]["tau"].as_float(), chosen.parse().ok(), "{scene}");
+    let said = succeeds(&["replay", "first/scene.toml", "--out", "again"]).stderr;
+    assert!(!said.contains("time.tau is not given"), "{said}");
+    assert_eq!(scene, std::fs::read_to_string(folder.path().join("again/scene.toml")).unwrap());
+    succeeds(&[&["render", "flame", "--out", "a.exr"][..], &small].concat());
+    let rendered: toml_edit::DocumentMut = std::fs::read_to_string(folder.path().join("a.scene.toml")).unwrap().parse().unwrap();
+    assert_eq!(rendered["time"]["tau"].as_float(), chosen.parse().ok());
+}
+
+#[test]
 fn one_picture_is_made_again_from_the_scene_beside_it() {
     let folder = tempfile::tempdir().unwrap();
     let succeeds = |arguments: &[&str]| drop(ridgewatch(folder.path(), arguments).success());
