@@ -311,7 +311,8 @@ fn numbers_that_are_not_finite_are_refused_in_every_checkpoint() {
             let fault = load(odd).unwrap_or_else(|| panic!("{kind:?}: taken with a NaN every {stride} bytes"));
             assert!(fault.contains("that are not finite; expected finite values"), "{kind:?}: {fault}");
         }
-        let of_network = ["stall", "caution", "first_loss", "smooth", "looked", "mean.0", "deviation.0"].map(|key| format!("network.{key}"));
+        let of_network =
+            ["stall", "caution", "first_loss", "smooth", "looked", "mean.0", "deviation.0"].map(|key| format!("network.{key}"));
         let keys = of_network.iter().map(String::as_str).filter(|_| kind != Kind::Table);
         for key in keys.chain((kind == Kind::Residual).then_some("shrinkage")) {
             for number in ["NaN", "inf", "-1e999"] {
