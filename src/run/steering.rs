@@ -152,7 +152,8 @@ impl Steering {
                 }
                 "paused" => change.paused = Some(read(key, value, "true or false")?),
                 "time.direction" => {
-                    let accepted = format!("\"{}\", as the run began: the other direction needs another window, and another run", self.direction);
+                    let accepted =
+                        format!("\"{}\", as the run began: the other direction needs another window, and another run", self.direction);
                     require(*value == *self.direction, key, value, &accepted)?;
                 }
                 other => {
@@ -189,7 +190,8 @@ fn read<'a, T: Deserialize<'a>>(key: &str, value: &'a Value, accepted: &str) -> 
     serde_path_to_error::deserialize(value).map_err(|error| {
         let inner = error.path().to_string();
         let key = if inner == "." { key.to_owned() } else { format!("{key}.{inner}") };
-        let found = if inner == "." && !value.is_object() { format!("is {}", shown(value)) } else { format!("cannot be read ({})", error.inner()) };
+        let found =
+            if inner == "." && !value.is_object() { format!("is {}", shown(value)) } else { format!("cannot be read ({})", error.inner()) };
         Refused::new(key, found, accepted)
     })
 }
@@ -264,7 +266,10 @@ mod tests {
         assert!(steering.is_pending_within(Duration::ZERO) && !steering.is_paused());
         let taken = steering.take();
         assert_eq!(serde_json::to_value(&taken[0]).unwrap(), json!({"number": 1000, "set": {"trust.tolerance": 1000.0}}));
-        assert_eq!((taken.len(), taken[1].number, &taken[1].set.camera, taken[1].set.paused), (2, 1001, &Some(steering.home.clone()), Some(false)));
+        assert_eq!(
+            (taken.len(), taken[1].number, &taken[1].set.camera, taken[1].set.paused),
+            (2, 1001, &Some(steering.home.clone()), Some(false))
+        );
         assert!(!steering.is_pending_within(Duration::from_millis(1)));
     }
 }

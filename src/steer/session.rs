@@ -121,20 +121,23 @@ impl Session {
     /// A session whose numbers no earlier one had, so that none of its commands is taken again.
     fn hello(&mut self, body: &[u8]) -> Result<Vec<u8>, Refused> {
         let accepted = "{\"hello\": 1, \"nonce\": \"64 hexadecimal digits\"}, or a signature and a command";
-        let hello: Hello = serde_json::from_slice(body).map_err(|error| Refused::new("hello", format!("cannot be read ({error})"), accepted))?;
+        let hello: Hello =
+            serde_json::from_slice(body).map_err(|error| Refused::new("hello", format!("cannot be read ({error})"), accepted))?;
         if hello.hello != VERSION {
             return Err(Refused::new("hello", format!("is {}", hello.hello), VERSION.to_string()));
         }
         let nonce = hello.nonce.as_deref().and_then(|nonce| from_hex(nonce.as_bytes()));
         let nonce = nonce.ok_or_else(|| Refused::new("nonce", format!("is {:?}", hello.nonce), "64 hexadecimal digits"))?;
-        let challenge = random().map_err(|error| Refused::new("hello", format!("came when there are no random numbers ({error})"), "it later"))?;
+        let challenge =
+            random().map_err(|error| Refused::new("hello", format!("came when there are no random numbers ({error})"), "it later"))?;
         (self.session, self.newest) = (Some(session_key(&self.key, &nonce, &challenge)), 0);
         Ok(json(&Hello { hello: VERSION, nonce: None, challenge: Some(hex(&challenge)) }))
     }
 
     /// The key of this session, if it has signed the command.
     fn verified(&self, signature: &[u8], body: &[u8]) -> Result<&Key, Refused> {
-        let session = self.session.as_ref().ok_or_else(|| Refused::new("hello", "is missing", "a hello before commands, on each connection"))?;
+        let session =
+            self.session.as_ref().ok_or_else(|| Refused::new("hello", "is missing", "a hello before commands, on each connection"))?;
         let given = from_hex(signature).filter(|given| session.verify(&[COMMAND, body], given).is_ok());
         let accepted = "that of this command with the key of the connection file and the challenge of this connection";
         given.map(|_| session).ok_or_else(|| Refused::new("signature", "is another one", accepted))
@@ -175,7 +178,9 @@ impl Answer for Session {
                 }
                 Err(refused) => refused,
             },
-            parts => Refused::new("message", format!("has {} parts", parts.len()), "a hello (1 part), or a signature and a command (2 parts)"),
+            parts => {
+                Refused::new("message", format!("has {} parts", parts.len()), "a hello (1 part), or a signature and a command (2 parts)")
+            }
         };
         (vec![json(&Answered { number: None, outcome: Outcome::Refused(refused.into()) })], false)
     }

@@ -35,7 +35,8 @@ impl CommandSocket {
             ..Limits::default()
         };
         let failed = |source| SteerError::Bind { endpoint: endpoint.to_owned(), source };
-        let resolved = if endpoint == crate::publish::DEFAULT_ENDPOINT { private_endpoint(NAME).map_err(failed)? } else { endpoint.to_owned() };
+        let resolved =
+            if endpoint == crate::publish::DEFAULT_ENDPOINT { private_endpoint(NAME).map_err(failed)? } else { endpoint.to_owned() };
         let key = Key::random()?;
         let answers = {
             let key = key.clone();
