@@ -158,7 +158,8 @@ impl Session<'_> {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
         let shown = options.dashboard.zip(output.endpoint());
-        let _dashboard = shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port));
+        let _dashboard =
+            shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port, commands.as_ref().map(CommandSocket::connection)));
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,
