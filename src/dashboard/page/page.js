@@ -223,8 +223,11 @@ function showSteering() {
   setText(element("obstacle"), obstacle ?? "");
   setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
   element("pause").setAttribute("aria-pressed", String(steering.paused));
-  const field = element("tolerance");
-  if (document.activeElement !== field && newest) field.value = newest.tolerance ?? "";
+  const values = { tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  for (const [id, value] of Object.entries(values)) {
+    // Not while it is typed.
+    if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
+  }
   setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
 }
 
@@ -298,6 +301,12 @@ element("share").addEventListener("click", share);
 element("tolerance").addEventListener("change", ({ target }) => {
   if (Number.isFinite(target.valueAsNumber)) steering.command({ "trust.tolerance": target.valueAsNumber });
 });
+for (const id of ["low", "high"]) {
+  element(id).addEventListener("change", () => {
+    const [low, high] = ["low", "high"].map((end) => element(end).valueAsNumber);
+    if (Number.isFinite(low) && Number.isFinite(high)) steering.command({ transfer: { low, high } });
+  });
+}
 
 explainTerms(element("tip"), element("terms"));
 showPosition();

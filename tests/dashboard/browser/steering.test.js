@@ -154,6 +154,20 @@ test("a tolerance is in a later record, and one that is not accepted is refused 
   });
 });
 
+test("a range of colours is in a later record, and on the colour bar", async () => {
+  await steered("map", async (page, where) => {
+    const { frame } = newest(where);
+    await page.fill("#high", "0.25");
+    await page.press("#high", "Enter");
+    const record = await commanded(where, frame, ["transfer"]);
+    assert.deepEqual([record.transfer.low, record.transfer.high], [0.05, 0.25]);
+    await until("the bar ends there", async () => (await page.locator("#scale-ticks span").allTextContents()).every((text) => Number(text) <= 0.25));
+    await page.fill("#low", "0.5");
+    await page.press("#low", "Enter");
+    await until("it is refused", async () => /Refused: `transfer.high` is 0.25; accepted: a finite number above transfer.low/.test(await page.textContent("#warnings")));
+  });
+});
+
 test("a pause holds the window, is said, and the view still moves", async () => {
   await steered("map", async (page, where) => {
     const { frame } = newest(where);
