@@ -30,7 +30,7 @@ pub struct Options {
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// Let the page steer the run whose connection file this is (`replay --steer`, `attach --steer`); by default the one of the private socket.
-    #[arg(long, value_name = "FILE", num_args = 0..=1)]
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<PathBuf>>,
 }
 

@@ -40,7 +40,7 @@ pub struct RunArguments {
     dashboard: Option<Option<u16>>,
     /// Accept signed commands (camera, tolerance, colours, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
     /// which is printed, holds the key. With --dashboard its page steers.
-    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_ENDPOINT)]
     steer: Option<String>,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]

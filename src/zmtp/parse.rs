@@ -392,6 +392,10 @@ mod tests {
                 }
             }
             prop_assert_eq!(parsed(&bytes, &pieces), parsed(&bytes, &[usize::MAX]));
+            // To a router, whose peer says REQ.
+            bytes.splice(0..bytes.len().min(GREETING + READY.len()), [greeting(), [&READY[..READY.len() - 3], b"REQ"].concat()].concat());
+            let routed = |pieces: &[usize]| parsed_by(Parser::of(Role::Router), &bytes, pieces);
+            prop_assert_eq!(routed(&pieces), routed(&[usize::MAX]));
         }
 
         #[test]

@@ -113,7 +113,8 @@ fn a_run_with_a_command_socket_is_steered_from_its_page() {
         scene::write(folder.path(), &double_gyre([32, 16, 1], "time.tau = 10\ntime.slides = 10000\nrender.method = \"reference\"\n"));
     let [frames, commands] = ["frames", "commands"].map(|name| format!("ipc://{}", folder.path().join(name).display()));
     let mut replay = ridgewatch(["replay", &scene, "--json", "--out", text(&folder.path().join("run")), "--dashboard=0"]);
-    let running = start(replay.args(["--publish", &frames, "--steer", &commands]).args(set(&["flow.steps=20", "publish.preview=false"])));
+    let running =
+        start(replay.args(["--publish", &frames, &format!("--steer={commands}")]).args(set(&["flow.steps=20", "publish.preview=false"])));
     let (address, token) = parts(&url(&running));
     let printed: serde_json::Value = serde_json::Deserializer::from_str(&running.stdout()).into_iter().next().unwrap().unwrap();
     let (_, watching) = parts(printed["watching_url"].as_str().unwrap());

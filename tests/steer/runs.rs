@@ -135,7 +135,7 @@ async fn the_program_is_steered_by_its_connection_file_alone() {
     let out = folder.path().join("run");
     let endpoint = format!("ipc://{}", folder.path().join("commands").display());
     let file = folder.path().join("commands.connection");
-    let mut replay = ridgewatch(["replay", &scene, "--steer", &endpoint, "--out", text(&out)]);
+    let mut replay = ridgewatch(["replay", &scene, &format!("--steer={endpoint}"), "--out", text(&out)]);
     let running = start(replay.args(set(&["flow.steps=20", "publish.preview=false"])));
     until("a connection file", || file.exists());
     let mut steerer = Steerer::connect(&file).await.unwrap();
@@ -147,6 +147,6 @@ async fn the_program_is_steered_by_its_connection_file_alone() {
     let outcome = running.wait_at_most(Duration::from_secs(60));
     assert!(outcome.stderr.contains(&format!("commands at {endpoint}, with the key in {}", file.display())), "{}", outcome.stderr);
     assert!(!file.exists(), "the key goes with the run");
-    let mut replay = ridgewatch(["replay", &scene, "--steer", "udp://127.0.0.1:1", "--out", text(&folder.path().join("no"))]);
+    let mut replay = ridgewatch(["replay", &scene, "--steer=udp://127.0.0.1:1", "--out", text(&folder.path().join("no"))]);
     crate::kit::program::run(&mut replay).refused(2, &["udp://127.0.0.1:1", "neither tcp:// nor ipc://"]);
 }

@@ -8,7 +8,7 @@ import { TOKEN, launch, parse, startDashboard, startPublisher, stop, temporary, 
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 // Of a box, and of a map.
-const box = { "time.frames_per_slide": 100_000, "time.warmup_frames": 0 };
+const box = { "time.frames_per_slide": 100_000, "time.warmup_frames": 0, "surrogate.table_nodes": "[17, 17, 17]", "flow.steps": 20 };
 const map = { "camera.orthographic": true };
 const scenes = { box: { scene: "configs/abc.toml", changes: box }, map: { scene: "configs/double_gyre.toml", changes: map } };
 const stages = {};
@@ -17,8 +17,8 @@ let browser;
 async function stage(name, options) {
   const folder = temporary();
   const [endpoint, commands] = [`ipc://${folder}/frames`, `${folder}/commands`];
-  const publisher = startPublisher(endpoint, folder, { ...options, more: ["--steer", `ipc://${commands}`] });
-  const dashboard = await startDashboard(endpoint, folder, 0, TOKEN, ["--steer", `${commands}.connection`]);
+  const publisher = startPublisher(endpoint, folder, { ...options, more: [`--steer=ipc://${commands}`] });
+  const dashboard = await startDashboard(endpoint, folder, 0, TOKEN, [`--steer=${commands}.connection`]);
   const records = () => readFileSync(path.join(folder, "run/records.jsonl"), "utf8").split("\n").slice(0, -1).map((line) => JSON.parse(line));
   stages[name] = { folder, endpoint, publisher, dashboard, records, address: (token) => `http://127.0.0.1:${dashboard.port}/?token=${token}` };
 }
@@ -61,7 +61,7 @@ const away = ({ eye, look_at: at }) => eye.map((value, k) => value - at[k]);
 const close = (a, b) => a.every((value, k) => Math.abs(value - b[k]) <= 1e-9 * (1 + Math.abs(b[k])));
 
 /** The first record with a command of these keys after `frame`. */
-const commanded = (where, frame, keys) => until(`a record with ${keys}`, () => where.records().find((record) => record.frame > frame && record.commands.some(({ set }) => String(Object.keys(set)) === String(keys))));
+const commanded = (where, frame, keys) => until(`a record with ${keys}`, () => where.records().find((record) => record.frame > frame && record.commands.some(({ set }) => String(Object.keys(set)) === String(keys))), 60_000);
 
 /** Drags by shares of the picture. */
 async function drag(page, across, down, button = "left") {
@@ -226,7 +226,7 @@ test("who has the address for watching sees the run, and is refused by the serve
 
 test("without a command socket the page says why", async () => {
   const { endpoint, folder } = stages.map;
-  for (const [more, why] of [[[], /^The run is not steered: the dashboard or the run was started without --steer\.$/], [["--steer", `${folder}/none`], /^The run is not steered: its command socket cannot be reached .*none/]]) {
+  for (const [more, why] of [[[], /^The run is not steered: the dashboard or the run was started without --steer\.$/], [[`--steer=${folder}/none`], /^The run is not steered: its command socket cannot be reached .*none/]]) {
     const { child, port } = await startDashboard(endpoint, temporary(), 0, TOKEN, more);
     const page = await open(`http://127.0.0.1:${port}/?token=${TOKEN}`);
     await until("it is said", async () => why.test(await page.textContent("#obstacle")));
