@@ -2,7 +2,7 @@
 //!
 //! The rooms; a room calls only those to its left:
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`] ← [`dashboard`], [`chart`] ← [`config`] ← the command line.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`], [`steer`] ← [`dashboard`], [`chart`] ← [`config`] ← the command line.
 //!
 //! Each room defines its settings and checks them with [`setting`]; [`config`] reads them from a scene file and finds the line of a fault.
 //! All rooms may call [`files`], [`progress`], [`setting`] and [`simd`]. Every room up to [`backend`] is a crate of its own.
@@ -15,6 +15,7 @@ pub mod config;
 pub mod dashboard;
 pub mod publish;
 pub mod run;
+pub mod steer;
 
 pub use ridgewatch_backend as backend;
 pub use ridgewatch_base::{files, folder, progress, setting};

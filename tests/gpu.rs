@@ -41,6 +41,8 @@ mod network_training;
 mod render;
 #[path = "gpu/scenes.rs"]
 mod scenes;
+#[path = "gpu/steering.rs"]
+mod steering;
 #[path = "gpu/table.rs"]
 mod table;
 #[path = "gpu/trace.rs"]

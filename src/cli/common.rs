@@ -11,6 +11,7 @@ use ridgewatch::render::Method;
 use ridgewatch::run::{RunError, Setup};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, expand};
+use ridgewatch::steer::SteerError;
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -61,7 +62,8 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
         let publish = cause.downcast_ref().is_some_and(|error: &PublishError| error.refused().is_some());
         let source = cause.downcast_ref().is_some_and(|error: &SourceError| error.refused().is_some());
         let dashboard = cause.downcast_ref().is_some_and(DashboardError::is_usage);
-        run || publish || dashboard || source || cause.is::<ConfigError>() || cause.is::<Usage>()
+        let steer = cause.downcast_ref().is_some_and(SteerError::is_usage);
+        run || publish || dashboard || steer || source || cause.is::<ConfigError>() || cause.is::<Usage>()
     });
     if configuration { 2 } else { 1 }
 }

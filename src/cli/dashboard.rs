@@ -5,8 +5,9 @@ use super::messages;
 use anyhow::{Result, bail};
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
 use ridgewatch::publish::DEFAULT_ENDPOINT;
+use ridgewatch::steer::default_connection;
 use std::net::{IpAddr, Ipv4Addr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Options of `dashboard`.
@@ -28,16 +29,21 @@ pub struct Options {
     /// Keep the token in this file (mode 0600), which is made if it does not exist, and print the address without it.
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
+    /// Let the page steer the run whose connection file this is (`replay --steer`, `attach --steer`); by default the one of the private socket.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
+    steer: Option<Option<PathBuf>>,
 }
 
 /// Serves the page until a signal comes.
 pub fn run(common: &Common, options: Options) -> Result<()> {
     if !common.overrides.is_empty() {
-        bail!(Usage("--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file".into()));
+        bail!(Usage("--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer".into()));
     }
-    let Options { endpoint, port, bind: address, allow_host: hosts, token_file } = options;
+    let Options { endpoint, port, bind: address, allow_host: hosts, token_file, steer } = options;
+    let steer = steer.map(|file| file.map_or_else(default_connection, Ok)).transpose()?;
     let token = token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
-    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token })?;
+    let is_steered = steer.is_some();
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer })?;
     if !address.is_loopback() {
         messages::note(format_args!(
             "{} is open to other machines: without encryption, whoever reads the network sees frames and token",
@@ -49,7 +55,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     runtime.block_on(async {
         // SIGHUP keeps its meaning: under `nohup` it is ignored.
         let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        announce(&dashboard, common.json, token_file.is_some())?;
+        announce(&dashboard, common.json, token_file.is_some(), is_steered)?;
         tokio::select! {
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
@@ -58,13 +64,15 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     })
 }
 
-/// Starts a dashboard beside a run that publishes at `endpoint`. Without one the run goes on.
-pub fn beside(common: &Common, endpoint: &str, port: Option<u16>) -> Option<Dashboard> {
-    let started =
-        Token::random().map_err(Into::into).and_then(|token| Dashboard::start(DashboardSettings::local(endpoint.to_owned(), port, token)));
+/// Starts a dashboard beside a run that publishes at `endpoint`, and takes commands if it has a connection file. Without one the run goes on.
+pub fn beside(common: &Common, endpoint: &str, port: Option<u16>, steer: Option<&Path>) -> Option<Dashboard> {
+    let started = Token::random().map_err(Into::into).and_then(|token| {
+        let settings = DashboardSettings::local(endpoint.to_owned(), port, token);
+        Dashboard::start(DashboardSettings { steer: steer.map(Path::to_owned), ..settings })
+    });
     match started {
         Ok(dashboard) => {
-            if let Err(error) = announce(&dashboard, common.json, false) {
+            if let Err(error) = announce(&dashboard, common.json, false, steer.is_some()) {
                 messages::note(format_args!("the address of the dashboard cannot be printed: {error}"));
             }
             Some(dashboard)
@@ -77,14 +85,22 @@ pub fn beside(common: &Common, endpoint: &str, port: Option<u16>) -> Option<Dash
 }
 
 /// Prints the address on standard output, since standard error often goes to a log that others may read.
-fn announce(dashboard: &Dashboard, json: bool, keeps_token: bool) -> Result<()> {
+fn announce(dashboard: &Dashboard, json: bool, keeps_token: bool, is_steered: bool) -> Result<()> {
     let address = dashboard.address();
     let url = if keeps_token { format!("http://{address}/") } else { dashboard.url() };
+    // Where nothing is steered, one address does.
+    let watching = Some(dashboard.watching_url()).filter(|_| is_steered && !keeps_token);
     if json {
-        return print_json(&serde_json::json!({ "url": url }));
+        return print_json(&match watching {
+            Some(watching) => serde_json::json!({ "url": url, "watching_url": watching }),
+            None => serde_json::json!({ "url": url }),
+        });
     }
     let token = if keeps_token { "?token= and the text of the token file" } else { "" };
     print_text(format_args!("dashboard: {url}{token}"));
+    if let Some(watching) = watching {
+        print_text(format_args!("for those who only watch: {watching}"));
+    }
     if address.ip().is_loopback() {
         let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
         let (port, host) = (address.port(), host.trim());

@@ -10,7 +10,8 @@ use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, Peers, PublishError, PublishSettings, RunFolder, Summary};
 use ridgewatch::render::Method;
-use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
+use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
+use ridgewatch::steer::CommandSocket;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -38,6 +39,10 @@ pub struct RunArguments {
     /// endpoint of --publish, or else where only this user reaches them.
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
     dashboard: Option<Option<u16>>,
+    /// Accept signed commands (camera, tolerance, colours, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
+    /// which is printed, holds the key. With --dashboard its page steers.
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_ENDPOINT)]
+    steer: Option<String>,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
@@ -136,6 +141,8 @@ impl Session<'_> {
         let mut publish = scene.publish_settings();
         let started = if options.dashboard.is_some() { start_shown(&mut publish) } else { Output::start(&publish, None) };
         let mut output = started.map_err(|error| located(&scene, error, PublishError::refused))?;
+        let steering = options.steer.as_ref().map(|endpoint| (endpoint, Arc::new(Steering::new(&setup.plan))));
+        let commands = steering.as_ref().map(|(endpoint, steering)| CommandSocket::bind(endpoint, Arc::clone(steering))).transpose()?;
         let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
         if out != options.out {
@@ -149,8 +156,12 @@ impl Session<'_> {
         if let Some(endpoint) = output.endpoint() {
             messages::note(format_args!("publishing at {endpoint}"));
         }
+        if let Some(commands) = &commands {
+            messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
+        }
         let shown = options.dashboard.zip(output.endpoint());
-        let _dashboard = shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port));
+        let _dashboard =
+            shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port, commands.as_ref().map(CommandSocket::connection)));
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,
@@ -159,6 +170,7 @@ impl Session<'_> {
             checkpoint_seconds: following.as_ref().map(|following| following.checkpoint_seconds),
             resume_if_fit: following.and_then(|following| following.resume_if_fit),
             device,
+            steering: steering.map(|(_, steering)| steering),
             abandon: stop.abandoned.clone(),
         };
         let (result, last, summary) = work(setup, &scene, &run_options, output, &stop.requested);

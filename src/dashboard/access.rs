@@ -13,10 +13,20 @@ const NO_TOKEN: Refused = "This page needs its token: open the address that ridg
 const HOST_REFUSED: Refused = "The host name of this address is not accepted: use localhost, or start ridgewatch with --allow-host and the name that the browser shows.\n";
 const ORIGIN_REFUSED: Refused = "Pages of other origins are not served.\n";
 
+/// What a token allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Rights {
+    /// To see frames, and to send commands.
+    Steer,
+    /// To see frames.
+    Watch,
+}
+
 /// Checks requests.
 #[derive(Debug)]
 pub(super) struct Access {
     token: Token,
+    watching: Token,
     /// Lower case.
     hosts: Vec<String>,
     address: SocketAddr,
@@ -31,7 +41,7 @@ impl Access {
                 return Err(DashboardError::HostName(host.clone()));
             }
         }
-        Ok(Self { token, hosts: hosts.iter().map(|host| host.to_ascii_lowercase()).collect(), address })
+        Ok(Self { watching: token.watching(), token, hosts: hosts.iter().map(|host| host.to_ascii_lowercase()).collect(), address })
     }
 
     /// Refuses names that a stranger may have pointed at this machine (DNS rebinding).
@@ -65,9 +75,18 @@ impl Access {
         if is_same || is_renamed { Ok(()) } else { Err(ORIGIN_REFUSED) }
     }
 
-    /// Accepts the token in the query. A cookie would go to all servers of this host, whatever their port.
-    pub fn check_token(&self, uri: &Uri) -> Result<(), Refused> {
-        if given_token(uri).is_some_and(|given| self.token.is(given)) { Ok(()) } else { Err(NO_TOKEN) }
+    /// What the token in the query allows. A cookie would go to all servers of this host, whatever their port.
+    pub fn check_token(&self, uri: &Uri) -> Result<Rights, Refused> {
+        match given_token(uri) {
+            Some(given) if self.token.is(given) => Ok(Rights::Steer),
+            Some(given) if self.watching.is(given) => Ok(Rights::Watch),
+            _ => Err(NO_TOKEN),
+        }
+    }
+
+    /// The token that only watches, for those who may steer.
+    pub fn token_to_share(&self, rights: Rights) -> Option<&str> {
+        (rights == Rights::Steer).then(|| self.watching.secret())
     }
 }
 
@@ -155,7 +174,11 @@ mod tests {
     fn the_token_comes_by_query() {
         let access = access(&[], "127.0.0.1:8577");
         let token = access.token.secret().to_owned();
-        let check = |query: &str| access.check_token(&format!("/{query}").parse().unwrap()).is_ok();
+        let rights = |query: &str| access.check_token(&format!("/{query}").parse().unwrap());
+        assert_eq!(rights(&format!("?token={token}")), Ok(Rights::Steer));
+        assert_eq!(rights(&format!("?token={}", access.token_to_share(Rights::Steer).unwrap())), Ok(Rights::Watch));
+        assert_eq!(access.token_to_share(Rights::Watch), None);
+        let check = |query: &str| rights(query).is_ok();
         assert!(check(&format!("?token={token}")) && check(&format!("?a=1&token={token}")));
         assert!(!check("") && !check("?token=") && !check(&format!("?token={}", &token[1..])) && !check("?token=wrong"));
     }

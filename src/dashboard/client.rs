@@ -1,11 +1,14 @@
-//! One browser: pictures at its pace, records, and the state of the publisher.
+//! One browser: pictures at its pace, records, the state of the publisher, and its commands.
 
-use super::hub::{Hub, Place};
+use super::hub::{self, Hub, Place};
+use super::steering::Answer;
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use bytes::Bytes;
 use serde::Deserialize;
+use serde_json::{Map, Value};
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::oneshot;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 /// Interval of messages about the publisher.
@@ -21,9 +24,18 @@ const POLICY: u16 = 1008;
 
 /// What the page says.
 #[derive(Debug, Deserialize)]
-struct Said {
-    ack: u64,
+#[serde(untagged)]
+enum Said {
+    /// A picture was drawn.
+    Drawn { ack: u64 },
+    /// A change of the run. The answer has the number.
+    Command { command: u64, set: Map<String, Value> },
 }
+
+/// A command whose answer has not come.
+type Asked = Option<(u64, oneshot::Receiver<Answer>)>;
+
+const ACCEPTED: &str = "a message that is not understood; accepted: {\"ack\":N}, {\"command\":N,\"set\":{...}}";
 
 /// Why a connection ends. Errors of the network need no answer.
 enum End {
@@ -33,16 +45,17 @@ enum End {
 
 enum Turn {
     Heard(Option<Result<Message, axum::Error>>),
+    Answered(u64, Answer),
     Picture,
     Records,
     Tick,
 }
 
-/// Serves a browser until it leaves, is lost, or loses its place.
-pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
+/// Serves a browser until it leaves, is lost, or loses its place. One that may steer is told a token to share with those who may not.
+pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>, token_to_share: Option<String>) {
     let place = hub.enter();
     let end = tokio::select! {
-        end = talk(&mut socket, &hub, &place) => end,
+        end = talk(&mut socket, &hub, &place, token_to_share.as_deref()) => end,
         () = place.displaced.notified() => End::Closed(DISPLACED, "too many pages are open; this one has drawn nothing for longest"),
     };
     if let End::Closed(code, reason) = end {
@@ -51,7 +64,7 @@ pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
     }
 }
 
-async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place) -> End {
+async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place, token_to_share: Option<&str>) -> End {
     let (mut pictures, mut recorded) = (hub.picture.subscribe(), hub.recorded.subscribe());
     // What is there already is news to this browser.
     pictures.mark_changed();
@@ -61,9 +74,11 @@ async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place) -> End {
     // Sequence of the picture that it is drawing.
     let mut drawing: Option<u64> = None;
     let (mut next_record, mut heard, mut pinged) = (0, Instant::now(), None);
+    let mut asked: Asked = None;
     loop {
         let turn = tokio::select! {
             message = socket.recv() => Turn::Heard(message),
+            (number, answer) = answered(&mut asked) => Turn::Answered(number, answer),
             // The hub outlives this.
             _ = pictures.changed(), if drawing.is_none() => Turn::Picture,
             _ = recorded.changed() => Turn::Records,
@@ -74,19 +89,32 @@ async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place) -> End {
                 (heard, pinged) = (Instant::now(), None);
                 match message {
                     Message::Text(text) => match serde_json::from_str::<Said>(&text) {
-                        Ok(Said { ack }) => {
+                        Ok(Said::Drawn { ack }) => {
                             drawing = drawing.filter(|sequence| *sequence != ack);
                             place.is_active();
+                            Ok(())
                         }
-                        Err(_) => return End::Closed(POLICY, "a message that is not understood; accepted: {\"ack\":N}"),
+                        Ok(Said::Command { command, .. }) if token_to_share.is_none() => {
+                            let why = "this address only watches; the one that ridgewatch printed first also steers".to_owned();
+                            send(socket, hub::answer(command, &Answer::Refused(why))).await
+                        }
+                        Ok(Said::Command { command, .. }) if asked.is_some() => {
+                            let why = "an earlier command of this page waits for its answer".to_owned();
+                            send(socket, hub::answer(command, &Answer::Refused(why))).await
+                        }
+                        Ok(Said::Command { command, set }) => {
+                            asked = Some((command, hub.wheel.command(set)));
+                            Ok(())
+                        }
+                        Err(_) => return End::Closed(POLICY, ACCEPTED),
                     },
-                    Message::Binary(_) => return End::Closed(POLICY, "a binary message; accepted: {\"ack\":N} as text"),
+                    Message::Binary(_) => return End::Closed(POLICY, "a binary message; accepted: text"),
                     Message::Close(_) => return End::Gone,
                     // Pings are answered by the library.
-                    Message::Ping(_) | Message::Pong(_) => {}
+                    Message::Ping(_) | Message::Pong(_) => Ok(()),
                 }
-                Ok(())
             }
+            Turn::Answered(number, answer) => send(socket, hub::answer(number, &answer)).await,
             Turn::Heard(_) => return End::Gone,
             Turn::Picture => {
                 let newest = pictures.borrow_and_update().clone();
@@ -115,13 +143,22 @@ async fn talk(socket: &mut WebSocket, hub: &Hub, place: &Place) -> End {
                         return End::Gone;
                     }
                 }
-                send(socket, hub.state()).await
+                send(socket, hub.state(token_to_share)).await
             }
         };
         if sent.is_err() {
             return End::Gone;
         }
     }
+}
+
+/// The answer to the command that was asked. Waits for ever without one.
+async fn answered(asked: &mut Asked) -> (u64, Answer) {
+    let Some((number, answer)) = asked else { return std::future::pending().await };
+    let answer = answer.await.unwrap_or_else(|_| Answer::Refused("the dashboard ends".to_owned()));
+    let number = *number;
+    *asked = None;
+    (number, answer)
 }
 
 /// Sends a message, which the browser must take in time.

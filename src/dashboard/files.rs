@@ -21,6 +21,7 @@ const STYLE: &str = "text/css; charset=utf-8";
 pub(super) const PAGE: File = file!("index.html", "text/html; charset=utf-8");
 
 const FILES: &[File] = &[
+    file!("camera.js", SCRIPT),
     file!("charts.js", SCRIPT),
     file!("colour_bar.js", SCRIPT),
     file!("connection.js", SCRIPT),
@@ -29,6 +30,7 @@ const FILES: &[File] = &[
     file!("picture.js", SCRIPT),
     file!("preferences.js", SCRIPT),
     file!("protocol.js", SCRIPT),
+    file!("steering.js", SCRIPT),
     file!("terms.js", SCRIPT),
     file!("warnings.js", SCRIPT),
     file!("words.js", SCRIPT),

@@ -1,5 +1,6 @@
 //! What all browsers share: the newest picture, the latest records, the state of the publisher.
 
+use super::steering::{Answer, Reach, Wheel};
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
 use bytes::Bytes;
 use ridgewatch_zmtp::{SubscribeError, Subscriber};
@@ -52,6 +53,8 @@ pub(super) struct Hub {
     records: Mutex<Records>,
     health: Mutex<Health>,
     clients: Mutex<Clients>,
+    /// For commands of the browsers.
+    pub wheel: Wheel,
 }
 
 /// The latest records, as JSON.
@@ -135,6 +138,10 @@ struct State<'a> {
     version: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     problem: Option<String>,
+    steering: Reach,
+    /// Token that only watches, for pages that may steer.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    token_to_share: Option<&'a str>,
 }
 
 /// What must be known of a picture's header. The page reads the rest.
@@ -145,9 +152,10 @@ struct Head {
 }
 
 impl Hub {
-    pub fn new(endpoint: String) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel) -> Self {
         Self {
             endpoint,
+            wheel,
             server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
             recorded: watch::Sender::new(0),
@@ -279,8 +287,8 @@ impl Hub {
         Some((message(&json, &[]), next))
     }
 
-    /// Message about the publisher.
-    pub fn state(&self) -> Bytes {
+    /// Message about the publisher, to a page that may steer if there is a token to share.
+    pub fn state(&self, token_to_share: Option<&str>) -> Bytes {
         let clients = lock(&self.clients).there.len();
         let health = lock(&self.health);
         let silence = health.last_message.map(|last| last.elapsed());
@@ -292,6 +300,8 @@ impl Hub {
             clients,
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
+            steering: self.wheel.reach(),
+            token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
     }
@@ -358,6 +368,18 @@ fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str, T), Strin
     let fault = |error: &dyn std::fmt::Display| format!("a message that is not understood: {error}");
     let text = std::str::from_utf8(json).map_err(|error| fault(&error))?;
     Ok((text, serde_json::from_str(text).map_err(|error| fault(&error))?))
+}
+
+/// Message with the answer to a command.
+pub(super) fn answer(number: u64, answer: &Answer) -> Bytes {
+    #[derive(Serialize)]
+    struct Answered<'a> {
+        kind: &'static str,
+        command: u64,
+        #[serde(flatten)]
+        answer: &'a Answer,
+    }
+    message(&serde_json::to_string(&Answered { kind: "answer", command: number, answer }).unwrap_or_default(), &[])
 }
 
 /// A message to the page: the length of the JSON as a little-endian u32, the JSON, and a picture.

@@ -1,7 +1,7 @@
 //! The dashboard: a web page that shows the published frames.
 //!
-//! In: the messages of a publisher, over ZeroMQ. Out: one page and a WebSocket, over HTTP. Calls `publish` for the names of messages, and the
-//! crate `ridgewatch-zmtp`.
+//! In: the messages of a publisher, over ZeroMQ, and commands of browsers. Out: one page and a WebSocket, over HTTP, and the commands to the run.
+//! Calls `publish` for the names of messages, `steer` for commands, and the crate `ridgewatch-zmtp`.
 //!
 //! One thread does all of it. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
 //! that none waits for another one and no queue grows behind it.
@@ -12,6 +12,7 @@ mod error;
 mod files;
 mod hub;
 mod server;
+mod steering;
 mod token;
 
 pub use error::DashboardError;
@@ -22,9 +23,11 @@ use hub::Hub;
 use ridgewatch_zmtp::{check_endpoint, private_endpoint};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
+use steering::Wheel;
 use tokio::sync::oneshot;
 
 /// Port that is taken if it is free.
@@ -43,14 +46,16 @@ pub struct DashboardSettings {
     pub port: Option<u16>,
     /// Names, besides those of this machine's loopback, by which browsers reach it through a proxy.
     pub hosts: Vec<String>,
-    /// What a browser must know.
+    /// What a browser must know to steer. Whoever knows [`Token::watching`] of it sees the same.
     pub token: Token,
+    /// Connection file of the run's command socket; `None`: pages only watch.
+    pub steer: Option<PathBuf>,
 }
 
 impl DashboardSettings {
-    /// Serves this machine only, with these frames.
+    /// Serves this machine only, with these frames, to those who watch.
     pub fn local(endpoint: String, port: Option<u16>, token: Token) -> Self {
-        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token }
+        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None }
     }
 }
 
@@ -71,7 +76,7 @@ impl Dashboard {
     /// # Errors
     /// An endpoint or a name of a host that is not accepted, a port in use, or an error of the system.
     pub fn start(settings: DashboardSettings) -> Result<Self, DashboardError> {
-        let DashboardSettings { endpoint, address, port, hosts, token } = settings;
+        let DashboardSettings { endpoint, address, port, hosts, token, steer } = settings;
         let endpoint = match endpoint.as_str() {
             crate::publish::DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|source| DashboardError::Private { source })?,
             _ => endpoint,
@@ -80,7 +85,8 @@ impl Dashboard {
         let listener = listen(address, port)?;
         let address = listener.local_addr()?;
         let access = Access::new(token.clone(), hosts, address)?;
-        let hub = Arc::new(Hub::new(endpoint.clone()));
+        let (wheel, requests) = Wheel::new(steer);
+        let hub = Arc::new(Hub::new(endpoint.clone(), wheel));
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
         let listener = {
             let _inside = runtime.enter();
@@ -93,6 +99,7 @@ impl Dashboard {
                     // Its sender is dropped.
                     _ = stopped => {}
                     () = hub.follow() => {}
+                    () = hub.wheel.drive(requests) => {}
                     () = server::serve(listener, access, Arc::clone(&hub)) => {}
                 }
             });
@@ -111,9 +118,14 @@ impl Dashboard {
         &self.endpoint
     }
 
-    /// Address of the page with the token: whoever knows it sees the frames.
+    /// Address of the page with the token: whoever knows it sees the frames, and steers.
     pub fn url(&self) -> String {
         format!("http://{}/?token={}", self.address, self.token.secret())
+    }
+
+    /// Address of the page with the token that only watches.
+    pub fn watching_url(&self) -> String {
+        format!("http://{}/?token={}", self.address, self.token.watching().secret())
     }
 }
 

@@ -111,11 +111,13 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
     }
     if path.ends_with("/socket") {
         access.check_origin(&parts.headers)?;
-        access.check_token(&parts.uri)?;
+        let rights = access.check_token(&parts.uri)?;
+        let token_to_share = access.token_to_share(rights).map(str::to_owned);
         return Ok(match WebSocketUpgrade::from_request_parts(&mut parts, &()).await {
-            Ok(upgrade) => {
-                upgrade.max_message_size(MAX_SAID_BYTES).max_frame_size(MAX_SAID_BYTES).on_upgrade(move |socket| client::serve(socket, hub))
-            }
+            Ok(upgrade) => upgrade
+                .max_message_size(MAX_SAID_BYTES)
+                .max_frame_size(MAX_SAID_BYTES)
+                .on_upgrade(move |socket| client::serve(socket, hub, token_to_share)),
             Err(rejection) => rejection.into_response(),
         });
     }

@@ -68,6 +68,12 @@ impl Token {
         Ok(Self(text.to_owned()))
     }
 
+    /// The token that only watches. It follows from this one, and this one does not follow from it.
+    pub fn watching(&self) -> Self {
+        let bytes = blake3::derive_key("ridgewatch 2026-11 dashboard: token that only watches", self.0.as_bytes());
+        Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+    }
+
     /// Compares in a time that does not depend on where the two differ.
     pub(super) fn is(&self, given: &str) -> bool {
         self.0.as_bytes().ct_eq(given.as_bytes()).into()
@@ -91,6 +97,8 @@ mod tests {
         assert_eq!(a.secret().len(), 2 * RANDOM_BYTES);
         assert!(a.is(a.secret()) && !a.is(b.secret()) && !a.is("") && !a.is(&a.secret()[1..]));
         assert!(!format!("{a:?}").contains(a.secret()));
+        let watching = a.watching();
+        assert!(watching == a.watching() && !a.is(watching.secret()) && watching != b.watching() && watching.secret().len() == 64);
     }
 
     #[test]

@@ -58,7 +58,7 @@ pub(super) fn assess<S: FrameSamples>(
     Ok(Some(Assessment {
         trusted,
         trusted_volume: gate.share(),
-        tolerance_excess: tolerance_excess(tally, trusted, audited, gate, run.plan.scene.trust.tolerance),
+        tolerance_excess: tolerance_excess(tally, trusted, audited, gate, run.learning.trust.tolerance()),
         over_budget: tally.over_budget,
         rendered: run.threads.render().install(|| residuals(frozen, &some, transfer, tau))?,
     }))
@@ -101,7 +101,7 @@ impl Run<'_> {
         if let Some(sizing) = &mut learning.sizing {
             // Over the whole domain, since untrusted regions may need a larger size.
             let everywhere = trusted_error(audited, &Gate::uniform(true));
-            learning.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, self.plan.scene.trust.tolerance));
+            learning.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, learning.trust.tolerance()));
         }
         self.keep_samples(on, &samples);
         self.keep_samples(on, &findings.samples);

@@ -9,7 +9,8 @@ use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
-use super::steps::{PictureSteps, is_outdated, picture_steps, suit_the_picture};
+use super::steering::{Command, Range, Steering};
+use super::steps::{PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
@@ -18,14 +19,15 @@ use super::{ColorBar, RunError, Settings, TransferRecord};
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
-use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
+use crate::progress;
+use crate::render::{MAX_FRAMES_UNTIL, Method, RenderError, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{CheckpointError, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
 use crate::trust::TrustMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Options of a run besides its scene.
 #[derive(Debug, Clone, Default)]
@@ -45,6 +47,8 @@ pub struct RunOptions {
     pub resume_if_fit: Option<PathBuf>,
     /// The device that computes.
     pub device: Device,
+    /// Commands to the run; `None`: nobody steers it.
+    pub steering: Option<Arc<Steering>>,
     /// Setting it abandons the frame in progress. It has an effect once a stop is requested; the run then ends as if the frame had not begun.
     pub abandon: Arc<AtomicBool>,
 }
@@ -105,6 +109,10 @@ pub struct RunReport {
 
 /// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
 const COARSE_IN_TIME: f64 = 0.25;
+/// Frames that refine a window that stands still, after each command.
+const FRAMES_WHILE_PAUSED: usize = 32;
+/// Interval at which a run that waits for a command looks for the end, and for the simulation.
+const GLANCE: Duration = Duration::from_millis(20);
 /// Maximum number of residuals of rendered samples that go to the trust map each frame. More would not improve the estimates of their cells.
 pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
 
@@ -178,6 +186,8 @@ pub(super) struct RunProgress {
     pub(super) seconds_per_sample: Option<f64>,
     /// Seconds that the loop paused since the last frame for a checkpoint.
     pub(super) checkpoint_pause: f64,
+    /// Commands that took effect since the last frame.
+    pub(super) commands: Vec<Command>,
 }
 
 impl RunProgress {
@@ -410,9 +420,9 @@ impl<'a> Run<'a> {
 impl<B: Backend> Cycle<'_, B> {
     /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer.
     fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
-        let Run { plan, threads, renderer, .. } = &self.run;
-        let Some(chosen) = chosen.filter(|choice| choice.within_tolerance && suit_the_picture(plan)) else { return Ok(()) };
-        let settled = threads.render().install(|| picture_steps(plan, slide, renderer.transfer(), chosen))?;
+        let shown = self.run.shown();
+        let Some(chosen) = chosen.filter(|choice| choice.within_tolerance && suit_the_picture(shown.plan)) else { return Ok(()) };
+        let settled = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
         self.settled = settled.map(|settled| (chosen, settled));
         if let Some(settled) = settled.filter(|settled| settled.steps < chosen.steps) {
             tracing::info!("{settled:?} instead of {chosen:?}");
@@ -425,14 +435,13 @@ impl<B: Backend> Cycle<'_, B> {
     /// Chooses the steps anew if they do not suit the picture of this slide.
     fn look_at_steps(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         let Some((chosen, settled)) = self.settled else { return Ok(()) };
-        let Run { plan, threads, renderer, .. } = &self.run;
-        let begin = Instant::now();
-        let anew = threads.render().install(|| {
-            if !is_outdated(plan, slide, renderer.transfer(), chosen, settled)? {
+        let (shown, begin) = (self.run.shown(), Instant::now());
+        let anew = self.run.threads.render().install(|| {
+            if !is_outdated(shown, slide, chosen, settled)? {
                 return Ok(None);
             }
-            let Some(anew) = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?.step_choice() else { return Ok(None) };
-            let settled = picture_steps(plan, slide, renderer.transfer(), anew)?;
+            let Some(anew) = cpu_tracer(slide.velocity.clone(), &shown.plan.map, slide.time)?.step_choice() else { return Ok(None) };
+            let settled = picture_steps(shown, slide, anew)?;
             Ok::<_, FlowError>(settled.map(|settled| (anew, settled)))
         })?;
         tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
@@ -459,7 +468,6 @@ impl<B: Backend> Cycle<'_, B> {
         self.prepare_first(&mut slide)?;
         loop {
             self.frames(&*slides, &mut slide, begun, sink)?;
-            transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
             // Tracer and slide both hold the window, on the host and on the device.
             with!(&mut self.session, on => {
                 on.tracer = None;
@@ -531,14 +539,18 @@ impl<B: Backend> Cycle<'_, B> {
         Ok(())
     }
 
-    /// The frames of one slide.
+    /// The frames of one slide, and what commands ask for besides.
     fn frames(&mut self, slides: &dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let target = self.run.plan.scene.render.until;
         let planned = warmups + time.frames_per_slide;
         let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
-        for number in 0..most {
+        let (mut number, mut since_command) = (0, 0);
+        loop {
+            if self.run.apply_commands() {
+                since_command = 0;
+            }
             let place =
                 FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
             if self.run.learning.resize.is_some() {
@@ -561,20 +573,44 @@ impl<B: Backend> Cycle<'_, B> {
             let is_done = target.is_some_and(is_good) && number >= warmups;
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
-            check_stop(self.run.stop)?;
-            if self.run.options.seconds.is_some_and(|seconds| self.run.began.elapsed().as_secs_f64() >= seconds) {
-                return Err(RunEnd::TimeIsUp);
+            self.run.check_end()?;
+            number += 1;
+            since_command += 1;
+            if self.run.is_paused() {
+                if is_done || since_command >= FRAMES_WHILE_PAUSED {
+                    while !self.run.is_commanded_within(GLANCE) {
+                        self.run.check_end()?;
+                    }
+                }
+                continue;
             }
-            let is_due = number + 1 >= planned && slides.is_awaited() == Some(false);
-            if let Some(target) = target.filter(|_| !is_done && (is_due || number + 1 == most)) {
+            let is_due = number >= planned && slides.is_awaited() == Some(false);
+            if !is_done && !is_due && number < most {
+                continue;
+            }
+            if let Some(target) = target.filter(|_| !is_done) {
                 let why = if is_due { "the next window is complete" } else { "no slide gets more frames" };
                 self.run.progress.warnings.push(format!("slide {}: the stated error is not yet below {target}, but {why}", slide.index));
             }
-            if is_done || is_due {
-                break;
+            transaction!(self, slide, run, on => run.train_meanwhile(on, slides, begun.elapsed().as_secs_f64()));
+            if !self.is_commanded_meanwhile(slides)? {
+                return Ok(());
             }
         }
-        Ok(())
+    }
+
+    /// Whether a command comes while a simulation's next window is incomplete: the slide then gets another frame.
+    fn is_commanded_meanwhile(&self, slides: &dyn Slides) -> Result<bool, RunEnd> {
+        if self.run.options.steering.is_none() {
+            return Ok(false);
+        }
+        while slides.is_awaited() == Some(true) {
+            if self.run.is_commanded_within(GLANCE) {
+                return Ok(true);
+            }
+            self.run.check_end()?;
+        }
+        Ok(false)
     }
 
     fn finish(&mut self) -> Result<(), RunError> {
@@ -600,6 +636,66 @@ impl<B: Backend> Cycle<'_, B> {
 }
 
 impl Run<'_> {
+    fn shown(&self) -> Shown<'_> {
+        Shown { plan: self.plan, transfer: self.renderer.transfer(), tolerance: self.learning.trust.tolerance() }
+    }
+
+    /// Ends the run if that was asked for, or its time is up.
+    fn check_end(&self) -> Result<(), RunEnd> {
+        progress::mark();
+        check_stop(self.stop)?;
+        let is_over = self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds);
+        if is_over { Err(RunEnd::TimeIsUp) } else { Ok(()) }
+    }
+
+    fn is_paused(&self) -> bool {
+        self.options.steering.as_ref().is_some_and(|steering| steering.is_paused())
+    }
+
+    /// Whether a command waits, or one comes within `limit`.
+    fn is_commanded_within(&self, limit: Duration) -> bool {
+        self.options.steering.as_ref().is_some_and(|steering| steering.is_pending_within(limit))
+    }
+
+    /// Applies the commands that came since the last frame. Returns whether there were any. A picture that accumulates notices what it no longer
+    /// shows, and starts anew.
+    fn apply_commands(&mut self) -> bool {
+        let Some(steering) = &self.options.steering else { return false };
+        let commands = steering.take();
+        let is_commanded = !commands.is_empty();
+        for command in commands {
+            match self.apply(&command) {
+                Ok(()) => self.progress.commands.push(command),
+                Err(refused) => self.progress.warnings.push(format!("command {} had no effect: {refused}", command.number)),
+            }
+        }
+        is_commanded
+    }
+
+    fn apply(&mut self, Command { set, .. }: &Command) -> Result<(), RenderError> {
+        if set.camera.is_some() || set.range.is_some() {
+            let mut scene = self.renderer.scene().clone();
+            scene.camera = set.camera.clone().unwrap_or(scene.camera);
+            if let Some(Range { low, high }) = set.range {
+                (scene.transfer.low, scene.transfer.high) = (Some(low), Some(high));
+            }
+            let renderer = &mut self.renderer;
+            self.threads.render().install(|| renderer.set_scene(scene))?;
+        }
+        if let Some(Range { low, high }) = set.range {
+            self.transfer = TransferRecord { low, high, ..self.transfer };
+            self.report.transfer = Some(self.transfer);
+            // Its residuals are those of another ramp.
+            self.learning.trust.reset();
+        }
+        if let Some(tolerance) = set.tolerance {
+            self.learning.trust.set_tolerance(tolerance);
+        }
+        let TransferRecord { low, high, .. } = self.transfer;
+        self.color_bar = Arc::new(ColorBar::new(&self.renderer, [low, high], &self.plan.time_unit));
+        Ok(())
+    }
+
     /// Starts a checkpoint if one is due. A disk error fails the checkpoint, not the run.
     fn checkpoint_if_due<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         if let (Some(checkpoints), Some(surrogate)) = (&mut self.checkpoints, &mut on.surrogate) {

@@ -1,6 +1,6 @@
 //! The cycle: slides of the window, frames, training, error estimates, checkpoints and records.
 //!
-//! In: [`Settings`]. Out: frames with their records. Calls `source`, `backend` and the rooms below it. Each frame is a transaction on one backend:
+//! In: [`Settings`], and commands while it goes on ([`Steering`]). Out: frames with their records. Calls `source`, `backend` and the rooms below it. Each frame is a transaction on one backend:
 //! its results take effect when it is complete. If the device fails, the frame is discarded and rendered again on the CPU.
 
 mod assess;
@@ -17,6 +17,7 @@ mod scene;
 mod settings;
 mod setup;
 mod slides;
+mod steering;
 mod steps;
 mod stop;
 mod training;
@@ -33,3 +34,4 @@ pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub(crate) use setup::auto_steps;
 pub use setup::{Plan, Setup};
 pub use slides::{Slide, Slides, open_snapshots};
+pub use steering::{Change, Command, Range, Steering, SteeringState};

@@ -283,7 +283,7 @@ impl Run<'_> {
         self.threads.render().install(|| interruptible.trace(&points, Extras::default(), &mut traced))?;
         check_stop(self.stop)?;
         let ramp = |s: f32| self.renderer.transfer().ramp(s / flow.tau() as f32);
-        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(labels.log_stretch[i])).abs()) <= self.plan.scene.trust.tolerance;
+        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(labels.log_stretch[i])).abs()) <= self.learning.trust.tolerance();
         let held = chosen.iter().zip(&traced.log_stretch).filter(|pair| holds(*pair)).count();
         Ok(held as f64 / chosen.len().max(1) as f64)
     }

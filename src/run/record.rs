@@ -1,5 +1,7 @@
 //! Record of a frame: a line of `records.jsonl`, and part of the header of a published frame.
 
+use super::steering::Command;
+use crate::render::CameraSettings;
 use crate::render::smooth::PictureError;
 use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
@@ -29,6 +31,15 @@ pub struct FrameRecord {
     /// Transfer function of the picture.
     #[serde(default)]
     pub transfer: TransferRecord,
+    /// The view. `None` in records of earlier versions.
+    #[serde(default)]
+    pub camera: Option<CameraSettings>,
+    /// Scene units of `camera` per unit of the domain's coordinates, along each axis.
+    #[serde(default)]
+    pub scale: [f64; 3],
+    /// Commands that this frame is the first to show.
+    #[serde(default)]
+    pub commands: Vec<Command>,
     /// `forward` or `backward`.
     pub direction: String,
     /// `reference`, `surrogate`, `gated`, `marched` or `two_level`.

@@ -21,6 +21,22 @@ const AGAIN: RangeInclusive<f64> = 0.01..=1.5;
 /// Random stream of the points on which steps are compared.
 const STREAM: u64 = u64::MAX - 1;
 
+/// What a picture shows of a flow.
+#[derive(Clone, Copy)]
+pub(super) struct Shown<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) transfer: &'a Transfer,
+    /// Allowed optical residual of the picture.
+    pub(super) tolerance: f64,
+}
+
+impl Shown<'_> {
+    /// The largest optical residual of the steps.
+    fn most(&self) -> f64 {
+        self.tolerance * if self.plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
+    }
+}
+
 /// A number of steps, and how far it is from twice as many as the log-stretch asks for. Root mean squares over points of the domain.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PictureSteps {
@@ -37,18 +53,13 @@ pub(super) struct PictureSteps {
 ///
 /// # Errors
 /// As for [`cpu_tracer`].
-pub(super) fn picture_steps(
-    plan: &Plan,
-    slide: &Slide,
-    transfer: &Transfer,
-    chosen: StepChoice,
-) -> Result<Option<PictureSteps>, FlowError> {
-    let cells = if plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
-    let Some(comparison) = Comparison::new(plan, slide, transfer, cells, 0, 2 * chosen.steps)? else { return Ok(None) };
+pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<Option<PictureSteps>, FlowError> {
+    let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
+    let Some(comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else { return Ok(None) };
     let mut multiple = 1;
     while multiple * chosen.multiple_of < chosen.steps {
         let found = comparison.of(multiple * chosen.multiple_of)?;
-        if found.residual <= most(plan) {
+        if found.residual <= shown.most() {
             return Ok(Some(found));
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
@@ -61,17 +72,11 @@ pub(super) fn picture_steps(
 ///
 /// # Errors
 /// As for [`cpu_tracer`].
-pub(super) fn is_outdated(
-    plan: &Plan,
-    slide: &Slide,
-    transfer: &Transfer,
-    chosen: StepChoice,
-    settled: PictureSteps,
-) -> Result<bool, FlowError> {
+pub(super) fn is_outdated(shown: Shown<'_>, slide: &Slide, chosen: StepChoice, settled: PictureSteps) -> Result<bool, FlowError> {
     // A quarter of the points of a choice, and others on each slide.
-    let cells = if plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
-    let Some(comparison) = Comparison::new(plan, slide, transfer, cells, slide.index, 2 * chosen.steps)? else { return Ok(false) };
-    let share = comparison.of(settled.steps)?.residual / most(plan).max(settled.residual);
+    let cells = if shown.plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
+    let Some(comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok(false) };
+    let share = comparison.of(settled.steps)?.residual / shown.most().max(settled.residual);
     let is_least = settled.steps <= chosen.multiple_of;
     Ok(share > *AGAIN.end() || share < *AGAIN.start() && !is_least)
 }
@@ -82,50 +87,37 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
     scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth()
 }
 
-/// The largest optical residual.
-fn most(plan: &Plan) -> f64 {
-    plan.scene.trust.tolerance * if plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
-}
-
 /// Points of a slide, and their log-stretch with many steps.
 struct Comparison<'a> {
-    plan: &'a Plan,
+    shown: Shown<'a>,
     slide: &'a Slide,
-    transfer: &'a Transfer,
     points: Vec<[f32; 3]>,
     truth: Traced,
 }
 
 impl<'a> Comparison<'a> {
     /// One point in each of the `cells` of the domain. `None` if too few of them show anything.
-    fn new(
-        plan: &'a Plan,
-        slide: &'a Slide,
-        transfer: &'a Transfer,
-        cells: [usize; 3],
-        number: u64,
-        steps: usize,
-    ) -> Result<Option<Self>, FlowError> {
+    fn new(shown: Shown<'a>, slide: &'a Slide, cells: [usize; 3], number: u64, steps: usize) -> Result<Option<Self>, FlowError> {
         // Not the seed of the picture, which would change the flow map.
         let unit = stratified_points(&Strata::even(cells, 1), number, STREAM);
-        let points = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
-        let mut comparison = Self { plan, slide, transfer, points, truth: Traced::default() };
+        let points = unit.into_iter().map(|unit| shown.plan.domain.from_unit(unit)).collect();
+        let mut comparison = Self { shown, slide, points, truth: Traced::default() };
         let reference = comparison.tracer(steps)?;
         comparison.points.retain(|&point| !reference.is_missing(point));
         reference.trace(&comparison.points, Extras::default(), &mut comparison.truth);
-        let shown = comparison.truth.log_stretch.iter().filter(|&&s| comparison.ramp(s) > 0.0).count();
+        let seen = comparison.truth.log_stretch.iter().filter(|&&s| comparison.ramp(s) > 0.0).count();
         let cells: usize = cells.iter().product();
-        Ok(Some(comparison).filter(|_| shown as f64 >= MIN_SHOWN * cells as f64))
+        Ok(Some(comparison).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
     }
 
     /// In double precision, as the steps of the log-stretch are chosen.
     fn tracer(&self, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
-        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.plan.map.clone() };
+        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.shown.plan.map.clone() };
         cpu_tracer(self.slide.velocity.clone(), &map, self.slide.time)
     }
 
     fn ramp(&self, log_stretch: f32) -> f64 {
-        f64::from(self.transfer.ramp(log_stretch / self.plan.map.tau as f32))
+        f64::from(self.shown.transfer.ramp(log_stretch / self.shown.plan.map.tau as f32))
     }
 
     fn of(&self, steps: usize) -> Result<PictureSteps, FlowError> {

@@ -94,6 +94,17 @@ impl TrustMap {
         }
     }
 
+    /// Allowed optical residual.
+    pub fn tolerance(&self) -> f64 {
+        self.settings.tolerance
+    }
+
+    /// Changes the allowed optical residual. What was measured stays; the evidence against the gate begins anew.
+    pub fn set_tolerance(&mut self, tolerance: f64) {
+        self.settings.tolerance = tolerance;
+        self.evidence = GateEvidence::new(tolerance);
+    }
+
     /// Cells along x, y and z.
     pub fn shape(&self) -> [usize; 3] {
         self.shape

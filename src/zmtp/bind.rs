@@ -1,5 +1,6 @@
 //! Endpoints: `tcp://HOST:PORT`, `ipc://PATH`, and the place that only this user reaches.
 
+use crate::owner::Owner;
 use rustix::fs::{CWD, FlockOperation, Mode, OFlags, flock, openat};
 use rustix::io::Errno;
 use std::fs::{DirBuilder, File, Permissions};
@@ -26,6 +27,12 @@ pub enum Peers {
     User,
     /// Whoever reaches the endpoint.
     Any,
+}
+
+impl Peers {
+    pub(crate) fn accept(self, owner: Owner) -> bool {
+        self == Self::Any || owner == Owner::User(user())
+    }
 }
 
 /// Why a socket cannot listen.

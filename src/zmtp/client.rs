@@ -3,7 +3,7 @@
 use crate::lock;
 use crate::message::{Keep, Message, command};
 use crate::owner::Owner;
-use crate::parse::{Fault, GREETING, Incoming, Parser};
+use crate::parse::{Fault, GREETING, Incoming, Parser, Role};
 use std::collections::{BTreeSet, VecDeque};
 use std::io;
 use std::sync::{Arc, Mutex};
@@ -173,18 +173,9 @@ impl Client {
         limits: &Limits,
         subscribed: impl Fn(),
     ) -> Result<(), End> {
-        let mut reader = Reader { parser: Parser::default(), left: f64::from(limits.frames), since: Instant::now(), limits };
+        let mut reader = Reader::new(Role::Pub, limits);
         let served = async {
-            let greeted = async {
-                to.write_all(&greeting()).await?;
-                reader.next(&mut from).await?;
-                // Only now: some peers close the connection if more than a greeting comes before theirs is out.
-                let mut ready = Vec::new();
-                command(&mut ready, b"READY", b"\x0bSocket-Type\0\0\0\x03PUB");
-                to.write_all(&ready).await?;
-                reader.next(&mut from).await
-            };
-            if timeout(limits.handshake, greeted).await.map_err(|_| End::Handshake)??.is_none() {
+            if !reader.greet(&mut from, &mut to).await? {
                 return Ok(());
             }
             tokio::select! {
@@ -217,7 +208,7 @@ impl Client {
                     outbox.ping = Some(context);
                     self.wake.notify_one();
                 }
-                Incoming::Greeting | Incoming::Ready | Incoming::Other => {}
+                Incoming::Greeting | Incoming::Ready | Incoming::Part { .. } | Incoming::Other => {}
             }
         }
         Ok(())
@@ -293,8 +284,16 @@ pub(crate) fn greeting() -> [u8; GREETING] {
     greeting
 }
 
+/// READY of a socket of this type.
+pub(crate) fn ready(socket_type: &[u8]) -> Vec<u8> {
+    let mut ready = Vec::new();
+    command(&mut ready, b"READY", &[b"\x0bSocket-Type\0\0\0", &[socket_type.len() as u8][..], socket_type].concat());
+    ready
+}
+
 /// Reads from a peer, at a bounded number of frames a minute.
-struct Reader<'a> {
+pub(crate) struct Reader<'a> {
+    role: Role,
     parser: Parser,
     /// Frames that the peer may send now.
     left: f64,
@@ -302,9 +301,26 @@ struct Reader<'a> {
     limits: &'a Limits,
 }
 
-impl Reader<'_> {
+impl<'a> Reader<'a> {
+    pub fn new(role: Role, limits: &'a Limits) -> Self {
+        Self { role, parser: Parser::of(role), left: f64::from(limits.frames), since: Instant::now(), limits }
+    }
+
+    /// Exchanges greeting and READY, in bounded time. Returns whether the peer is still there.
+    pub async fn greet(&mut self, from: &mut (impl AsyncRead + Unpin), to: &mut (impl AsyncWrite + Unpin)) -> Result<bool, End> {
+        let limit = self.limits.handshake;
+        let greeted = async {
+            to.write_all(&greeting()).await?;
+            self.next(from).await?;
+            // Only now: some peers close the connection if more than a greeting comes before theirs is out.
+            to.write_all(&ready(if self.role == Role::Pub { b"PUB" } else { b"ROUTER" })).await?;
+            self.next(from).await
+        };
+        Ok(timeout(limit, greeted).await.map_err(|_| End::Handshake)??.is_some())
+    }
+
     /// The next unit. `None` at the end of the stream.
-    async fn next(&mut self, from: &mut (impl AsyncRead + Unpin)) -> Result<Option<Incoming>, End> {
+    pub async fn next(&mut self, from: &mut (impl AsyncRead + Unpin)) -> Result<Option<Incoming>, End> {
         loop {
             if let Some(incoming) = self.parser.parse()? {
                 let most = f64::from(self.limits.frames);

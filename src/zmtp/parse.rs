@@ -1,10 +1,10 @@
-//! What a subscriber sends (rfc.zeromq.org/spec/23 and 37): greeting, READY, subscriptions, PING.
+//! What a peer sends (rfc.zeromq.org/spec/23 and 37): greeting, READY, PING, and subscriptions or the parts of messages.
 
 use thiserror::Error;
 
 /// Length of a greeting, in bytes.
 pub(crate) const GREETING: usize = 64;
-/// Maximum length of a frame from a peer. A frame holds a topic or a few properties.
+/// Maximum length of a frame from a peer. A frame holds a topic, a few properties or a command.
 const MAX_FRAME_BYTES: usize = 4096;
 /// Longest header of a frame, in bytes.
 const HEADER: usize = 9;
@@ -36,9 +36,12 @@ pub enum Fault {
     /// Something else where READY is due.
     #[error("no READY after the greeting")]
     Ready,
-    /// A socket that is not SUB or XSUB.
-    #[error("its socket is neither SUB nor XSUB")]
+    /// A socket that is not SUB or XSUB, or not DEALER or REQ.
+    #[error("its socket is of a type that is not served")]
     SocketType,
+    /// A message of too many parts.
+    #[error("a message of more parts than are accepted")]
+    Parts,
     /// The peer reports an error of its own.
     #[error("the peer sent ERROR")]
     Error,
@@ -61,10 +64,35 @@ pub enum Incoming {
     Subscribe(Vec<u8>),
     /// A topic that ends.
     Cancel(Vec<u8>),
+    /// A part of a message to a ROUTER.
+    Part {
+        /// Its bytes.
+        body: Vec<u8>,
+        /// Whether another part follows.
+        more: bool,
+    },
     /// A PING; PONG returns its context.
     Ping(Vec<u8>),
     /// Anything else, which is ignored.
     Other,
+}
+
+/// The socket that is served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Role {
+    /// PUB, to SUB and XSUB.
+    Pub,
+    /// ROUTER, to DEALER and REQ.
+    Router,
+}
+
+impl Role {
+    fn accepts(self, socket_type: &[u8]) -> bool {
+        match self {
+            Self::Pub => matches!(socket_type, b"SUB" | b"XSUB"),
+            Self::Router => matches!(socket_type, b"DEALER" | b"REQ"),
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -77,6 +105,7 @@ enum Stage {
 /// Reads the bytes of one peer, in a buffer of fixed size.
 #[derive(Debug)]
 pub struct Parser {
+    role: Role,
     stage: Stage,
     buffer: Box<[u8]>,
     start: usize,
@@ -87,11 +116,16 @@ pub struct Parser {
 
 impl Default for Parser {
     fn default() -> Self {
-        Self { stage: Stage::Greeting, buffer: vec![0; HEADER + MAX_FRAME_BYTES].into(), start: 0, end: 0, within: false }
+        Self::of(Role::Pub)
     }
 }
 
 impl Parser {
+    /// A parser of what peers send to this socket.
+    pub fn of(role: Role) -> Self {
+        Self { role, stage: Stage::Greeting, buffer: vec![0; HEADER + MAX_FRAME_BYTES].into(), start: 0, end: 0, within: false }
+    }
+
     /// Where to put the next bytes. Never empty once [`Parser::parse`] has returned `None`.
     pub fn space(&mut self) -> &mut [u8] {
         self.buffer.copy_within(self.start..self.end, 0);
@@ -107,7 +141,7 @@ impl Parser {
     /// The next complete unit. `None`: more bytes are needed.
     ///
     /// # Errors
-    /// Bytes that no subscriber sends. The peer is not to be read any further.
+    /// Bytes that no peer of this socket sends. The peer is not to be read any further.
     pub fn parse(&mut self) -> Result<Option<Incoming>, Fault> {
         if self.stage == Stage::Greeting { self.greeting() } else { self.frame() }
     }
@@ -148,9 +182,10 @@ impl Parser {
         let first = !std::mem::replace(&mut self.within, flags & MORE != 0);
         let incoming = match self.stage {
             Stage::Open if flags & COMMAND != 0 => command(body)?,
+            Stage::Open if self.role == Role::Router => Incoming::Part { body: body.to_vec(), more: flags & MORE != 0 },
             Stage::Open if flags & MORE == 0 && first => message(body),
             Stage::Open => Incoming::Other,
-            _ if flags & COMMAND != 0 => ready(body)?,
+            _ if flags & COMMAND != 0 => ready(body, self.role)?,
             _ => return Err(Fault::Ready),
         };
         self.stage = Stage::Open;
@@ -186,24 +221,24 @@ fn command(body: &[u8]) -> Result<Incoming, Fault> {
     })
 }
 
-fn ready(body: &[u8]) -> Result<Incoming, Fault> {
+fn ready(body: &[u8], role: Role) -> Result<Incoming, Fault> {
     let (name, mut properties) = short(body)?;
     match name {
         b"READY" => {}
         b"ERROR" => return Err(Fault::Error),
         _ => return Err(Fault::Ready),
     }
-    let mut subscriber = false;
+    let mut is_served = false;
     while !properties.is_empty() {
         let (key, rest) = short(properties)?;
         let (length, rest) = rest.split_first_chunk::<4>().ok_or(Fault::Command)?;
         let (value, rest) = rest.split_at_checked(u32::from_be_bytes(*length) as usize).ok_or(Fault::Command)?;
         if key.eq_ignore_ascii_case(b"Socket-Type") {
-            subscriber = matches!(value, b"SUB" | b"XSUB");
+            is_served = role.accepts(value);
         }
         properties = rest;
     }
-    if subscriber { Ok(Incoming::Ready) } else { Err(Fault::SocketType) }
+    if is_served { Ok(Incoming::Ready) } else { Err(Fault::SocketType) }
 }
 
 #[cfg(test)]
@@ -228,7 +263,11 @@ mod tests {
 
     /// What bytes mean that arrive in pieces of these lengths, in turn.
     fn parsed(bytes: &[u8], pieces: &[usize]) -> Result<Vec<Incoming>, Fault> {
-        let (mut parser, mut rest, mut found) = (Parser::default(), bytes, Vec::new());
+        parsed_by(Parser::default(), bytes, pieces)
+    }
+
+    fn parsed_by(mut parser: Parser, bytes: &[u8], pieces: &[usize]) -> Result<Vec<Incoming>, Fault> {
+        let (mut rest, mut found) = (bytes, Vec::new());
         for piece in pieces.iter().cycle() {
             while let Some(incoming) = parser.parse()? {
                 found.push(incoming);
@@ -318,6 +357,24 @@ mod tests {
         assert_eq!(parsed(&curve, &[usize::MAX]), Err(Fault::Mechanism));
     }
 
+    #[test]
+    fn a_router_gets_the_parts_of_messages_and_other_peers() {
+        let ready = |kind: &[u8]| {
+            let body = [&b"\x05READY\x0bSocket-Type\0\0\0"[..], &[kind.len() as u8], kind].concat();
+            [greeting(), frame(COMMAND, body.len() as u64, &body)].concat()
+        };
+        let router = |bytes: &[u8]| parsed_by(Parser::of(Role::Router), bytes, &[3]);
+        for kind in [&b"DEALER"[..], b"REQ"] {
+            let bytes = [ready(kind), frame(MORE, 0, b""), frame(0, 2, b"\x01a"), frame(COMMAND, 8, b"\x04PING\0\0a")].concat();
+            let part = |body: &[u8], more| Incoming::Part { body: body.to_vec(), more };
+            let expected = [Incoming::Greeting, Incoming::Ready, part(b"", true), part(b"\x01a", false), Incoming::Ping(b"a".to_vec())];
+            assert_eq!(router(&bytes).unwrap(), expected);
+            assert_eq!(parsed(&bytes, &[3]), Err(Fault::SocketType));
+            assert_eq!(router(&[ready(kind), frame(LONG, 4097, b"")].concat()), Err(Fault::Length(4097)));
+        }
+        assert_eq!(router(&ready(b"SUB")), Err(Fault::SocketType));
+    }
+
     proptest! {
         /// Changed, removed and added bytes end in a fault or in units, never in a panic, and not differently in other pieces.
         #[test]
@@ -335,6 +392,10 @@ mod tests {
                 }
             }
             prop_assert_eq!(parsed(&bytes, &pieces), parsed(&bytes, &[usize::MAX]));
+            // To a router, whose peer says REQ.
+            bytes.splice(0..bytes.len().min(GREETING + READY.len()), [greeting(), [&READY[..READY.len() - 3], b"REQ"].concat()].concat());
+            let routed = |pieces: &[usize]| parsed_by(Parser::of(Role::Router), &bytes, pieces);
+            prop_assert_eq!(routed(&pieces), routed(&[usize::MAX]));
         }
 
         #[test]

@@ -12,6 +12,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
+use tokio::runtime::Runtime;
 use tokio::sync::{Notify, watch};
 
 /// Descriptors that a runtime needs at most, with some to spare.
@@ -21,7 +22,7 @@ const BATCH: usize = 64;
 /// Pause after a connection could not be accepted, because no descriptor is free for instance.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Longest wait, at the end, for a lookup of users.
-const SHUTDOWN_LIMIT: Duration = Duration::from_millis(100);
+pub(crate) const SHUTDOWN_LIMIT: Duration = Duration::from_millis(100);
 /// Share of [`Limits::stall`] after which a subscriber gives way to one that is ready, if too many messages are in flight.
 const GIVE_WAY: u32 = 8;
 
@@ -74,17 +75,7 @@ impl PubSocket {
     /// # Errors
     /// An endpoint that is not accepted or in use, or an error of the system.
     pub fn bind(endpoint: &str, peers: Option<Peers>, limits: Limits) -> Result<Self, BindError> {
-        let (bound, endpoint) = Bound::open(endpoint)?;
-        let peers = peers.unwrap_or(if bound.is_local() { Peers::User } else { Peers::Any });
-        bound.open_to(peers)?;
-        // Where another crate enables tokio's signals, the runtime panics without these descriptors.
-        let spare = (0..SPARE_DESCRIPTORS).map(|_| std::fs::File::open("/dev/null")).collect::<io::Result<Vec<_>>>()?;
-        drop(spare);
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
-        let listener = {
-            let _inside = runtime.enter();
-            Listener::new(bound)?
-        };
+        let Opened { listener, endpoint, peers, runtime } = Opened::new(endpoint, peers)?;
         let shared = Arc::new(Shared {
             limits,
             clients: Mutex::default(),
@@ -166,12 +157,39 @@ impl Drop for PubSocket {
     }
 }
 
-enum Listener {
+/// A socket that listens, and the runtime that will serve it.
+pub(crate) struct Opened {
+    pub listener: Listener,
+    /// With the port that was bound.
+    pub endpoint: String,
+    pub peers: Peers,
+    pub runtime: Runtime,
+}
+
+impl Opened {
+    /// Listens; see [`PubSocket::bind`].
+    pub fn new(endpoint: &str, peers: Option<Peers>) -> Result<Self, BindError> {
+        let (bound, endpoint) = Bound::open(endpoint)?;
+        let peers = peers.unwrap_or(if bound.is_local() { Peers::User } else { Peers::Any });
+        bound.open_to(peers)?;
+        // Where another crate enables tokio's signals, the runtime panics without these descriptors.
+        let spare = (0..SPARE_DESCRIPTORS).map(|_| std::fs::File::open("/dev/null")).collect::<io::Result<Vec<_>>>()?;
+        drop(spare);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
+        let listener = {
+            let _inside = runtime.enter();
+            Listener::new(bound)?
+        };
+        Ok(Self { listener, endpoint, peers, runtime })
+    }
+}
+
+pub(crate) enum Listener {
     Tcp(TcpListener),
     Unix(UnixListener, #[expect(dead_code, reason = "removes the file at the end")] crate::bind::SocketFile),
 }
 
-enum Stream {
+pub(crate) enum Stream {
     Tcp(TcpStream),
     Unix(UnixStream),
 }
@@ -214,7 +232,7 @@ impl Listener {
     }
 
     /// All connections that wait, up to [`BATCH`], with their owners; at least one.
-    async fn batch(&self) -> Vec<(Stream, Owner)> {
+    pub async fn batch(&self) -> Vec<(Stream, Owner)> {
         let mut batch = Vec::new();
         while batch.is_empty() {
             match self.accept().await {
@@ -285,7 +303,7 @@ async fn run(listener: Listener, peers: Peers, shared: Arc<Shared>, mut closing:
 impl Shared {
     /// Starts to serve a connection.
     fn admit(self: &Arc<Self>, stream: Stream, owner: Owner, peers: Peers) {
-        if peers == Peers::User && owner != Owner::User(rustix::process::geteuid().as_raw()) {
+        if !peers.accept(owner) {
             lock(&self.counts).refused += 1;
             return;
         }

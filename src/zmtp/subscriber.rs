@@ -1,11 +1,12 @@
-//! The other end: a connection that subscribes, and reads messages of bounded length.
+//! The other end: a connection that subscribes or asks, and reads messages of bounded length.
 //!
 //! Not the crate `zeromq` (0.7), which reserves as much memory as the header of a frame announces, whatever that is.
 
 use crate::bind::Place;
-use crate::client::greeting;
+use crate::client::{greeting, ready};
 use crate::message::{command, header};
 use crate::parse::{COMMAND, GREETING, LONG, MORE};
+use crate::router::message_bytes;
 use bytes::{Buf, Bytes, BytesMut};
 use std::io::{self, ErrorKind};
 use std::time::Duration;
@@ -30,7 +31,7 @@ pub enum SubscribeError {
     #[error("{0}; accepted: tcp://HOST:PORT, ipc://PATH")]
     Endpoint(String),
     /// The peer is no publisher.
-    #[error("the other end is no publisher of ZMTP 3 with the mechanism NULL: {0}")]
+    #[error("the other end does not speak ZMTP 3 with the mechanism NULL: {0}")]
     Peer(&'static str),
     /// A message that is too long.
     #[error("a message of more than {most} bytes or {MAX_PARTS} parts")]
@@ -62,13 +63,7 @@ impl Subscriber {
     /// # Errors
     /// An endpoint that is not accepted, a peer that is no publisher or does not answer in 5 seconds, an error of the system.
     pub async fn connect(endpoint: &str, topics: &[&str], most: usize) -> Result<Self, SubscribeError> {
-        let connected = timeout(HANDSHAKE, async {
-            let stream: Box<dyn Stream> = match Place::of(endpoint).map_err(SubscribeError::Endpoint)? {
-                Place::Unix(path) => Box::new(UnixStream::connect(path).await?),
-                Place::Tcp(address, port) => Box::new(TcpStream::connect((address, port)).await?),
-            };
-            Self::over(stream, topics, most).await
-        });
+        let connected = timeout(HANDSHAKE, async { Self::over(reach(endpoint).await?, topics, most).await });
         connected.await.unwrap_or_else(|_| Err(io::Error::from(ErrorKind::TimedOut).into()))
     }
 
@@ -78,31 +73,29 @@ impl Subscriber {
     /// A peer that is no publisher, or an error of the system.
     pub async fn over(stream: Box<dyn Stream>, topics: &[&str], most: usize) -> Result<Self, SubscribeError> {
         let mut subscriber = Self { stream, buffer: BytesMut::new(), parts: Vec::new(), most };
-        subscriber.shake_hands(topics).await?;
-        Ok(subscriber)
-    }
-
-    async fn shake_hands(&mut self, topics: &[&str]) -> Result<(), SubscribeError> {
-        self.stream.write_all(&greeting()).await?;
-        let mut theirs = [0; GREETING];
-        self.stream.read_exact(&mut theirs).await?;
-        if (theirs[0], theirs[9]) != (0xff, 0x7f) || theirs[10] < 3 || !theirs[12..].starts_with(b"NULL\0") {
-            return Err(SubscribeError::Peer("another greeting"));
-        }
-        let mut ready = Vec::new();
-        command(&mut ready, b"READY", b"\x0bSocket-Type\0\0\0\x03SUB");
-        self.stream.write_all(&ready).await?;
-        match self.frame().await? {
-            (flags, body) if flags & COMMAND != 0 && body.starts_with(b"\x05READY") => {}
-            _ => return Err(SubscribeError::Peer("no READY")),
-        }
+        subscriber.shake_hands(b"SUB").await?;
         let mut subscriptions = Vec::new();
         for topic in topics {
             header(&mut subscriptions, 0, 1 + topic.len());
             subscriptions.push(1);
             subscriptions.extend(topic.as_bytes());
         }
-        Ok(self.stream.write_all(&subscriptions).await?)
+        subscriber.stream.write_all(&subscriptions).await?;
+        Ok(subscriber)
+    }
+
+    async fn shake_hands(&mut self, socket_type: &[u8]) -> Result<(), SubscribeError> {
+        self.stream.write_all(&greeting()).await?;
+        let mut theirs = [0; GREETING];
+        self.stream.read_exact(&mut theirs).await?;
+        if (theirs[0], theirs[9]) != (0xff, 0x7f) || theirs[10] < 3 || !theirs[12..].starts_with(b"NULL\0") {
+            return Err(SubscribeError::Peer("another greeting"));
+        }
+        self.stream.write_all(&ready(socket_type)).await?;
+        match self.frame().await? {
+            (flags, body) if flags & COMMAND != 0 && body.starts_with(b"\x05READY") => Ok(()),
+            _ => Err(SubscribeError::Peer("no READY")),
+        }
     }
 
     /// The parts of the next message. May be cancelled: what was read of a message is kept.
@@ -159,6 +152,45 @@ impl Subscriber {
                 }
             }
         }
+    }
+}
+
+async fn reach(endpoint: &str) -> Result<Box<dyn Stream>, SubscribeError> {
+    Ok(match Place::of(endpoint).map_err(SubscribeError::Endpoint)? {
+        Place::Unix(path) => Box::new(UnixStream::connect(path).await?),
+        Place::Tcp(address, port) => Box::new(TcpStream::connect((address, port)).await?),
+    })
+}
+
+/// A connection to a [`crate::RouterSocket`], of type DEALER. It is not restored when it ends.
+pub struct Requester(Subscriber);
+
+impl Requester {
+    /// Connects to `tcp://HOST:PORT` or `ipc://PATH`. Answers have at most `most` bytes.
+    ///
+    /// # Errors
+    /// As for [`Subscriber::connect`].
+    pub async fn connect(endpoint: &str, most: usize) -> Result<Self, SubscribeError> {
+        let connected = timeout(HANDSHAKE, async {
+            let mut connection = Subscriber { stream: reach(endpoint).await?, buffer: BytesMut::new(), parts: Vec::new(), most };
+            connection.shake_hands(b"DEALER").await?;
+            Ok(Self(connection))
+        });
+        connected.await.unwrap_or_else(|_| Err(io::Error::from(ErrorKind::TimedOut).into()))
+    }
+
+    /// Sends a message and returns the parts of its answer.
+    ///
+    /// # Errors
+    /// There is no answer within `limit`, or the connection has ended. It is not to be used any more then.
+    pub async fn ask(&mut self, parts: &[&[u8]], limit: Duration) -> Result<Vec<Bytes>, SubscribeError> {
+        let mut bytes = Vec::new();
+        message_bytes(&mut bytes, parts);
+        let answered = timeout(limit, async {
+            self.0.stream.write_all(&bytes).await?;
+            self.0.receive().await
+        });
+        answered.await.unwrap_or_else(|_| Err(io::Error::from(ErrorKind::TimedOut).into()))
     }
 }
 

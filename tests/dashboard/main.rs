@@ -4,6 +4,7 @@
 #[path = "../kit/mod.rs"]
 mod kit;
 mod program;
+mod steering;
 mod visitor;
 
 use kit::publishing;
@@ -15,6 +16,7 @@ use ridgewatch_zmtp::{Keep, Limits, PubSocket};
 use serde_json::json;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -42,12 +44,16 @@ struct Stage {
 
 impl Stage {
     fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
+        Self::with(tempfile::tempdir().unwrap(), None)
+    }
+
+    /// With the connection file of a command socket.
+    fn with(folder: TempDir, steer: Option<PathBuf>) -> Self {
         let token = Token::random().unwrap();
         let secret = token.secret().to_owned();
         let endpoint = format!("ipc://{}", folder.path().join("frames").display());
-        let dashboard = Dashboard::start(DashboardSettings::local(endpoint, Some(0), token)).unwrap();
-        Self { folder, dashboard, token: secret }
+        let settings = DashboardSettings { steer, ..DashboardSettings::local(endpoint, Some(0), token) };
+        Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
     }
 
     fn address(&self) -> SocketAddr {
@@ -328,7 +334,7 @@ fn messages_that_are_not_understood_are_told_and_cost_nothing() {
 #[test]
 fn a_page_that_says_something_else_is_disconnected() {
     let stage = Stage::new();
-    for odd in ["", "{}", "ack", "{\"ack\":-1}"] {
+    for odd in ["", "{}", "ack", "{\"ack\":-1}", "{\"command\":1}", "{\"command\":1,\"set\":[]}"] {
         let mut visitor = stage.visit();
         visitor.say(odd);
         assert_eq!(visitor.close_code(), 1008, "{odd:?}");

@@ -105,3 +105,25 @@ fn a_run_shows_itself_and_goes_on_without_a_free_port() {
     assert!(outcome.stderr.contains("there is no dashboard: cannot listen at"), "{}", outcome.stderr);
     assert!(outcome.json()["frames"].as_u64().unwrap() > 0);
 }
+
+#[test]
+fn a_run_with_a_command_socket_is_steered_from_its_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene =
+        scene::write(folder.path(), &double_gyre([32, 16, 1], "time.tau = 10\ntime.slides = 10000\nrender.method = \"reference\"\n"));
+    let [frames, commands] = ["frames", "commands"].map(|name| format!("ipc://{}", folder.path().join(name).display()));
+    let mut replay = ridgewatch(["replay", &scene, "--json", "--out", text(&folder.path().join("run")), "--dashboard=0"]);
+    let running =
+        start(replay.args(["--publish", &frames, &format!("--steer={commands}")]).args(set(&["flow.steps=20", "publish.preview=false"])));
+    let (address, token) = parts(&url(&running));
+    let printed: serde_json::Value = serde_json::Deserializer::from_str(&running.stdout()).into_iter().next().unwrap().unwrap();
+    let (_, watching) = parts(printed["watching_url"].as_str().unwrap());
+    let mut visitor = Visitor::open(address, &token);
+    visitor.until_state(|state| state["steering"]["ready"]["dimensions"] == 2 && state["token_to_share"] == watching.as_str());
+    visitor.say(r#"{"command": 1, "set": {"trust.tolerance": 0.125}}"#);
+    assert_eq!(visitor.next("answer").json["accepted"]["commands"], 1);
+    while visitor.frame().json["header"]["record"]["tolerance"] != 0.125 {}
+    running.signal(libc::SIGTERM);
+    let outcome = running.wait();
+    assert!(!outcome.stderr.contains(&token) && !outcome.stderr.contains(&watching), "{}", outcome.stderr);
+}

@@ -62,20 +62,30 @@ impl Key {
         mac
     }
 
-    fn signature(&self, parts: &[&[u8]]) -> [u8; SIGNATURE] {
+    /// HMAC-SHA256 of the parts, one after the other.
+    pub fn signature(&self, parts: &[&[u8]]) -> [u8; SIGNATURE] {
         self.sign(parts).finalize().into_bytes().into()
     }
 
-    fn verify(&self, parts: &[&[u8]], signature: &[u8; SIGNATURE]) -> Result<(), WireError> {
+    /// Another key, from this one and the parts.
+    pub fn derive(&self, parts: &[&[u8]]) -> Self {
+        Self(self.signature(parts))
+    }
+
+    /// Compares with [`Self::signature`].
+    ///
+    /// # Errors
+    /// [`WireError::Signature`] if it is another one.
+    pub fn verify(&self, parts: &[&[u8]], signature: &[u8; SIGNATURE]) -> Result<(), WireError> {
         // Compares in constant time.
         self.sign(parts).verify_slice(signature).map_err(|_| WireError::Signature)
     }
 }
 
-/// Address of a relay, and its key.
+/// Address of a relay or of a command socket, and its key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConnectionFile {
-    /// `HOST:PORT`.
+    /// `HOST:PORT`, or the endpoint of a command socket.
     pub address: String,
     /// The shared key.
     pub key: Key,
@@ -123,7 +133,7 @@ impl FromStr for ConnectionFile {
     fn from_str(text: &str) -> Result<Self, WireError> {
         let value = |key: &'static str| {
             let line = text.lines().find_map(|line| line.strip_prefix(key)?.trim_start().strip_prefix('='));
-            line.map(str::trim).ok_or_else(|| WireError::field(key, "missing", "a connection file as `ridgewatch relay` writes it"))
+            line.map(str::trim).ok_or_else(|| WireError::field(key, "missing", "a connection file as ridgewatch writes it"))
         };
         let version = value("ridgewatch-connection")?;
         if version != "1" {
@@ -203,7 +213,7 @@ pub struct Session {
 impl Session {
     /// `nonces`: the relay's and the follower's.
     fn begin(key: &Key, nonces: [&[u8; 32]; 2]) -> Self {
-        Self { key: Key(key.signature(&[b"session", nonces[0], nonces[1]])), number: 0, asked: 0 }
+        Self { key: key.derive(&[b"session", nonces[0], nonces[1]]), number: 0, asked: 0 }
     }
 
     /// Accepts a follower, as the relay.

@@ -42,6 +42,11 @@ export class Connection {
     socket.onclose = ({ code }) => (code === DISPLACED ? this.stop() : this.lose());
   }
 
+  /** Sends a message, if the connection is open. */
+  say(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
   receive(socket, data) {
     this.heard = performance.now();
     this.delay = FIRST_DELAY;

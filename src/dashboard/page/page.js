@@ -5,6 +5,7 @@ import { Connection } from "./connection.js";
 import { Records } from "./history.js";
 import { Picture } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
+import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
@@ -21,6 +22,13 @@ const warnings = new Warnings();
 const colourBar = new ColourBar(element("colour-bar"));
 const picture = new Picture(element("frame"), pictureChanged);
 const charts = new Charts(element("charts"), (frame) => picture.lookBack(picture.kept.nearest(frame)));
+
+const steering = new Steering({
+  say: (message) => connection.say(message),
+  told: (text, frame, urgent) => (urgent ? warnings.hold("command", text, frame) : warnings.log.add(text, frame)),
+  // A command is followed live.
+  acted: () => { if (picture.held) picture.follow(); },
+});
 
 let connection;
 let newest = null;
@@ -61,6 +69,7 @@ function receiveRecords(message) {
     newest = record;
   }
   warnings.read(fresh);
+  steering.receiveRecords(fresh);
   chartsDue ||= fresh.length > 0;
 }
 
@@ -81,6 +90,7 @@ async function receiveFrame({ sequence, header, payload }, reply) {
 
 function receiveState(state) {
   server = state;
+  steering.receiveState(state);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 
@@ -88,6 +98,7 @@ const RECEIVERS = {
   frame: receiveFrame,
   records: receiveRecords,
   state: receiveState,
+  answer: (answer) => steering.receiveAnswer(answer),
 };
 
 // Showing
@@ -99,7 +110,8 @@ function currentView() {
   return {
     link: connection.status,
     retryAt: connection.retryAt,
-    status: server?.status,
+    // A run that was told to pause is not lost.
+    status: steering.paused && ["following", "silent"].includes(server?.status) ? "paused" : server?.status,
     endpoint: server?.endpoint,
     problem: server?.problem,
     silence: silence(),
@@ -110,7 +122,7 @@ function currentView() {
 
 function kindOf(view) {
   if (view.link !== "open") return view.link;
-  if (view.status === "silent" || view.status === "waiting") return view.status;
+  if (["silent", "waiting", "paused"].includes(view.status)) return view.status;
   return view.back ? "back" : "following";
 }
 
@@ -203,8 +215,37 @@ function showState() {
   setText(element("about"), server ? `ridgewatch ${server.version ?? ""} at ${server.endpoint ?? "–"}, ${count(server.clients)} watching` : "");
 }
 
+function showSteering() {
+  const { obstacle } = steering;
+  const can = obstacle === null;
+  element("frame").classList.toggle("steered", can);
+  for (const node of document.querySelectorAll("#steering .steers")) node.hidden = !can;
+  setText(element("obstacle"), obstacle ?? "");
+  setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
+  element("pause").setAttribute("aria-pressed", String(steering.paused));
+  const values = { tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  for (const [id, value] of Object.entries(values)) {
+    // Not while it is typed.
+    if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
+  }
+  setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
+}
+
+async function share() {
+  const address = new URL("./", location.href);
+  address.searchParams.set("token", server?.token_to_share ?? "");
+  const text = address.href;
+  try {
+    await navigator.clipboard.writeText(text);
+    setText(element("share"), "Copied");
+  } catch {
+    prompt("Address for those who only watch:", text);
+  }
+}
+
 function refresh() {
   showState();
+  showSteering();
   showLog();
   if (!chartsDue || document.hidden) return;
   chartsDue = false;
@@ -233,11 +274,13 @@ const KEYS = {
   f: toggleFullScreen,
   t: switchTheme,
   "?": () => element("help").showModal(),
+  ...steeringKeys(steering),
 };
 
 function pressKey(event) {
   const { key, target } = event;
-  const used = event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
+  const types = target.matches("input[type=number]");
+  const used = types || event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
   if (used || KEYS[key] === undefined) return;
   event.preventDefault();
   KEYS[key]();
@@ -251,12 +294,25 @@ element("full-screen").addEventListener("click", toggleFullScreen);
 element("theme").addEventListener("click", switchTheme);
 element("open-help").addEventListener("click", () => element("help").showModal());
 document.addEventListener("keydown", pressKey);
+steerBy(element("frame"), steering);
+element("pause").addEventListener("click", () => steering.togglePause());
+element("home").addEventListener("click", () => steering.home());
+element("share").addEventListener("click", share);
+element("tolerance").addEventListener("change", ({ target }) => {
+  if (Number.isFinite(target.valueAsNumber)) steering.command({ "trust.tolerance": target.valueAsNumber });
+});
+for (const id of ["low", "high"]) {
+  element(id).addEventListener("change", () => {
+    const [low, high] = ["low", "high"].map((end) => element(end).valueAsNumber);
+    if (Number.isFinite(low) && Number.isFinite(high)) steering.command({ transfer: { low, high } });
+  });
+}
 
 explainTerms(element("tip"), element("terms"));
 showPosition();
 connection = new Connection(takeToken(), {
   message: (message, reply) => RECEIVERS[message.kind]?.(message, reply),
-  opened: () => { server = null; },
+  opened: () => { server = null; steering.reset(); },
   broken: (error) => warnings.hold("message", `A message of the server was skipped: ${error.message}`),
 });
 setInterval(refresh, REFRESH);

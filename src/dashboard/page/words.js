@@ -72,6 +72,7 @@ export function sentence(view) {
     return words ? `${state}; last seen: ${words}.` : `${state}.`;
   }
   if (view.status === "silent") return words ? `Silent for ${duration(view.silence)}; last: ${words}.` : `Silent for ${duration(view.silence)}.`;
+  if (view.status === "paused" && words) return `The window is paused, ${words}.`;
   if (view.status === "waiting" && words) return `Waiting for the publisher; last seen: ${words}.`;
   if (words) return `Following, ${words}.`;
   return view.endpoint ? `Waiting for the first frame from ${view.endpoint}.` : "Waiting for the first frame.";

@@ -55,19 +55,20 @@ export async function stop(child, signal = "SIGTERM") {
   await once(child, "exit");
 }
 
-export function startPublisher(endpoint, folder) {
-  const settings = Object.entries(SMALL).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
-  const child = start(["replay", "configs/double_gyre.toml", "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings]);
+/** A run that publishes; `more` are further options, and `changes` further keys. */
+export function startPublisher(endpoint, folder, { scene = "configs/double_gyre.toml", changes = {}, more = [] } = {}) {
+  const settings = Object.entries({ ...SMALL, ...changes }).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
+  const child = start(["replay", scene, "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings, ...more]);
   child.stdout.resume();
   child.once("exit", (code) => { if (code) console.error(`the publisher ended: ${child.log}`); });
   return child;
 }
 
 /** The server, and the port of its page. */
-export async function startDashboard(endpoint, folder, port = 0, token = TOKEN) {
+export async function startDashboard(endpoint, folder, port = 0, token = TOKEN, more = []) {
   const file = path.join(folder, "token");
   writeFileSync(file, `${token}\n`, { mode: 0o600 });
-  const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json"]);
+  const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json", ...more]);
   let text = "";
   child.stdout.on("data", (part) => { text += part; });
   const url = await until("the dashboard prints its address", () => {

@@ -1,9 +1,9 @@
-//! Handshakes, subscriptions and messages of any bytes, read as a publisher and as a subscriber reads them: no panic, no memory for what is only
+//! Handshakes, subscriptions and messages of any bytes, read as a publisher, a router and a subscriber read them: no panic, no memory for what is only
 //! announced, and no other meaning if the bytes arrive in other pieces.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use ridgewatch_zmtp::{Fault, Incoming, Parser, Subscriber};
+use ridgewatch_zmtp::{Fault, Incoming, Parser, Role, Subscriber};
 use std::io::Cursor;
 use tokio::io::{join, sink};
 
@@ -22,9 +22,9 @@ fn handshake(socket: &[u8; 3]) -> Vec<u8> {
     bytes
 }
 
-/// What the bytes mean to a publisher, if they arrive in pieces of one length.
-fn parsed(bytes: &[u8], piece: usize) -> (Vec<Incoming>, Option<Fault>) {
-    let (mut parser, mut rest, mut found) = (Parser::default(), bytes, Vec::new());
+/// What the bytes mean to a socket, if they arrive in pieces of one length.
+fn parsed(role: Role, bytes: &[u8], piece: usize) -> (Vec<Incoming>, Option<Fault>) {
+    let (mut parser, mut rest, mut found) = (Parser::of(role), bytes, Vec::new());
     loop {
         match parser.parse() {
             Ok(Some(unit)) => found.push(unit),
@@ -54,9 +54,10 @@ async fn received(bytes: Vec<u8>) {
 fuzz_target!(|input: &[u8]| {
     let Some((&kind, bytes)) = input.split_first() else { return };
     let after = |socket| if kind & 1 == 1 { [handshake(socket), bytes.to_vec()].concat() } else { bytes.to_vec() };
-    let subscriber = after(b"SUB");
     let piece = 1 + usize::from(kind >> 1);
-    assert_eq!(parsed(&subscriber, piece), parsed(&subscriber, usize::MAX));
+    for (role, peer) in [(Role::Pub, after(b"SUB")), (Role::Router, after(b"REQ"))] {
+        assert_eq!(parsed(role, &peer, piece), parsed(role, &peer, usize::MAX));
+    }
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
     runtime.block_on(received(after(b"PUB")));
 });

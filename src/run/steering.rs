@@ -1,0 +1,275 @@
+//! Commands to a run in progress: checked as they come, applied between two frames, and kept in the record of the frame that shows them first.
+
+use super::setup::{Plan, assemble};
+use crate::field::Domain;
+use crate::render::{Camera, CameraSettings, Transfer, TransferSettings};
+use crate::setting::{Refused, require, shown};
+use crate::trust::TrustSettings;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+/// What a command may change, by the names of the scene file. Values that are not given stay as they are.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Change {
+    /// The view, in scene units (see `scale` of [`super::FrameRecord`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<CameraSettings>,
+    /// Allowed optical residual.
+    #[serde(rename = "trust.tolerance", default, skip_serializing_if = "Option::is_none")]
+    pub tolerance: Option<f64>,
+    /// FTLE (1/time) at which extinction begins and is full.
+    #[serde(rename = "transfer", default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<Range>,
+    /// True: the window stands still.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub paused: Option<bool>,
+}
+
+/// Ramp of the transfer function.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Range {
+    /// FTLE (1/time) at which extinction begins.
+    pub low: f64,
+    /// FTLE (1/time) from which extinction is full.
+    pub high: f64,
+}
+
+impl Change {
+    fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Removes what a later change sets.
+    fn remove(&mut self, later: &Self) {
+        self.camera = self.camera.take().filter(|_| later.camera.is_none());
+        self.tolerance = self.tolerance.filter(|_| later.tolerance.is_none());
+        self.range = self.range.filter(|_| later.range.is_none());
+        self.paused = self.paused.filter(|_| later.paused.is_none());
+    }
+}
+
+/// A command that took effect.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Command {
+    /// Number of the command in this run, from 1.
+    pub number: u64,
+    /// What it changed, without what a later command changed before the next frame.
+    pub set: Change,
+}
+
+/// State of a run for those who steer it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SteeringState {
+    /// Number of accepted commands that changed something.
+    pub commands: u64,
+    /// Whether the window stands still.
+    pub paused: bool,
+    /// 2 or 3.
+    pub dimensions: usize,
+}
+
+/// The commands to a run. Its memory does not grow with them: a later value replaces an earlier one that has not taken effect.
+#[derive(Debug)]
+pub struct Steering {
+    /// The view at the start.
+    home: CameraSettings,
+    aspect: f64,
+    trust: TrustSettings,
+    transfer: TransferSettings,
+    direction: &'static str,
+    dimensions: usize,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    commands: u64,
+    paused: bool,
+    /// For the next frame.
+    pending: Vec<Command>,
+}
+
+impl Steering {
+    /// For a run of this plan.
+    pub fn new(plan: &Plan) -> Self {
+        let scene = &plan.scene;
+        let Domain { dimensions, .. } = plan.domain;
+        Self {
+            home: assemble(scene, &plan.domain).camera,
+            aspect: scene.render.aspect(),
+            trust: scene.trust.clone(),
+            transfer: scene.transfer.clone().unwrap_or_default(),
+            direction: plan.map.direction.name(),
+            dimensions,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        }
+    }
+
+    /// Takes a command, which the next frame will show. All of it is accepted, or nothing.
+    ///
+    /// # Errors
+    /// The first key that is unknown or cannot change during a run, or whose value is not accepted.
+    pub fn command(&self, set: &Map<String, Value>) -> Result<SteeringState, Refused> {
+        let change = self.check(set)?;
+        let mut state = self.lock();
+        if !change.is_empty() {
+            state.commands += 1;
+            state.paused = change.paused.unwrap_or(state.paused);
+            state.pending.iter_mut().for_each(|earlier| earlier.set.remove(&change));
+            state.pending.retain(|earlier| !earlier.set.is_empty());
+            let number = state.commands;
+            state.pending.push(Command { number, set: change });
+            self.changed.notify_all();
+        }
+        Ok(SteeringState { commands: state.commands, paused: state.paused, dimensions: self.dimensions })
+    }
+
+    fn check(&self, set: &Map<String, Value>) -> Result<Change, Refused> {
+        let mut change = Change::default();
+        for (key, value) in set {
+            match key.as_str() {
+                "camera" if value.is_null() => change.camera = Some(self.home.clone()),
+                "camera" => {
+                    let camera: CameraSettings = read(key, value, "eye, look_at, up, field_of_view and orthographic, as in a scene file")?;
+                    Camera::new(&camera, self.aspect).map_err(Refused::from)?;
+                    change.camera = Some(camera);
+                }
+                "trust.tolerance" => {
+                    let tolerance = read(key, value, "a number above 0")?;
+                    TrustSettings { tolerance, ..self.trust.clone() }.check()?;
+                    change.tolerance = Some(tolerance);
+                }
+                "transfer" => {
+                    let range: Range = read(key, value, "low and high, two numbers")?;
+                    let settings = TransferSettings { low: Some(range.low), high: Some(range.high), ..self.transfer.clone() };
+                    Transfer::new(&settings, 1.0).map_err(Refused::from)?;
+                    change.range = Some(range);
+                }
+                "paused" => change.paused = Some(read(key, value, "true or false")?),
+                "time.direction" => {
+                    let accepted =
+                        format!("\"{}\", as the run began: the other direction needs another window, and another run", self.direction);
+                    require(*value == *self.direction, key, value, &accepted)?;
+                }
+                other => {
+                    let accepted = "camera, trust.tolerance, transfer and paused: all else stays as the run began";
+                    return Err(Refused::new(other, "cannot change during a run", accepted));
+                }
+            }
+        }
+        Ok(change)
+    }
+
+    /// The commands since the last call.
+    pub(super) fn take(&self) -> Vec<Command> {
+        std::mem::take(&mut self.lock().pending)
+    }
+
+    pub(super) fn is_paused(&self) -> bool {
+        self.lock().paused
+    }
+
+    /// Whether a command waits, or one comes within `limit`.
+    pub(super) fn is_pending_within(&self, limit: Duration) -> bool {
+        let waited = self.changed.wait_timeout_while(self.lock(), limit, |state| state.pending.is_empty());
+        !waited.unwrap_or_else(PoisonError::into_inner).0.pending.is_empty()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Reads a value; a fault names the key inside it.
+fn read<'a, T: Deserialize<'a>>(key: &str, value: &'a Value, accepted: &str) -> Result<T, Refused> {
+    serde_path_to_error::deserialize(value).map_err(|error| {
+        let inner = error.path().to_string();
+        let key = if inner == "." { key.to_owned() } else { format!("{key}.{inner}") };
+        let found =
+            if inner == "." && !value.is_object() { format!("is {}", shown(value)) } else { format!("cannot be read ({})", error.inner()) };
+        Refused::new(key, found, accepted)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn steering() -> Steering {
+        Steering {
+            home: CameraSettings { eye: [0.0, 0.0, 2.0], look_at: [0.0; 3], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true },
+            aspect: 2.0,
+            trust: TrustSettings::default(),
+            transfer: TransferSettings::default(),
+            direction: "forward",
+            dimensions: 2,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        }
+    }
+
+    fn command(steering: &Steering, set: Value) -> Result<SteeringState, String> {
+        steering.command(set.as_object().unwrap()).map_err(|refused| refused.to_string())
+    }
+
+    #[test]
+    fn what_is_refused_is_named_and_changes_nothing() {
+        let steering = steering();
+        let eye = json!([0.0, 0.0, 1.0]);
+        let camera = |key: &str, value: Value| {
+            let mut camera = json!({"eye": eye, "look_at": [0, 0, 0], "up": [0, 1, 0]});
+            camera[key] = value;
+            json!({ "camera": camera })
+        };
+        for (set, hint) in [
+            (camera("up", json!([0, 0, 1])), "`camera.up` is [0.0, 0.0, 1.0]; accepted: a vector that is not parallel"),
+            (camera("look_at", eye.clone()), "`camera.look_at` is [0.0, 0.0, 1.0]; accepted: a point other than"),
+            (camera("field_of_view", json!(180)), "`camera.field_of_view` is 180.0; accepted: degrees above 0"),
+            (camera("eye", json!([0, 0])), "`camera.eye"),
+            (camera("eye", json!("left")), "`camera.eye` cannot be read (invalid type: string \"left\""),
+            (camera("zoom", json!(2)), "`camera.zoom` cannot be read (unknown field `zoom`"),
+            (json!({"camera": {}}), "`camera` cannot be read (missing field `eye`)"),
+            (json!({"camera": 3}), "`camera` is 3; accepted: eye, look_at"),
+            (json!({"trust.tolerance": 0}), "`trust.tolerance` is 0.0; accepted: a number above 0"),
+            (json!({"trust.tolerance": "low"}), "`trust.tolerance` is \"low\"; accepted: a number above 0"),
+            (json!({"transfer": {"low": 2, "high": 1}}), "`transfer.high` is 1.0"),
+            (json!({"transfer": {"low": 2}}), "`transfer` cannot be read (missing field `high`)"),
+            (json!({"paused": 1}), "`paused` is 1; accepted: true or false"),
+            (json!({"time.direction": "backward"}), "`time.direction` is \"backward\"; accepted: \"forward\", as the run began"),
+            (json!({"render.method": "gated"}), "`render.method` cannot change during a run; accepted: camera"),
+            // One of two keys is wrong.
+            (json!({"paused": true, "trust.tolerance": -1}), "`trust.tolerance` is -1.0"),
+        ] {
+            let error = command(&steering, set).unwrap_err();
+            assert!(error.starts_with(hint), "{error}\n{hint}");
+        }
+        assert!(steering.take().is_empty() && !steering.is_paused());
+        let state = SteeringState { commands: 0, paused: false, dimensions: 2 };
+        assert_eq!(command(&steering, json!({})), Ok(state));
+        assert_eq!(command(&steering, json!({"time.direction": "forward"})), Ok(state));
+    }
+
+    #[test]
+    fn a_later_value_replaces_one_that_has_not_taken_effect() {
+        let steering = steering();
+        for n in 1..=1000 {
+            let set = json!({"trust.tolerance": f64::from(n), "paused": n == 1000});
+            assert_eq!(command(&steering, set).unwrap().commands, n as u64);
+        }
+        command(&steering, json!({"camera": null, "paused": false})).unwrap();
+        assert!(steering.is_pending_within(Duration::ZERO) && !steering.is_paused());
+        let taken = steering.take();
+        assert_eq!(serde_json::to_value(&taken[0]).unwrap(), json!({"number": 1000, "set": {"trust.tolerance": 1000.0}}));
+        assert_eq!(
+            (taken.len(), taken[1].number, &taken[1].set.camera, taken[1].set.paused),
+            (2, 1001, &Some(steering.home.clone()), Some(false))
+        );
+        assert!(!steering.is_pending_within(Duration::from_millis(1)));
+    }
+}

@@ -1,0 +1,237 @@
+// Steering from the page in Chromium: what is done there is in the records of the run, and who only watches is refused by the server.
+import assert from "node:assert/strict";
+import { mkdirSync, readFileSync } from "node:fs";
+import path from "node:path";
+import { after, before, beforeEach, test } from "node:test";
+import { WebSocket } from "ws";
+import { TOKEN, launch, parse, startDashboard, startPublisher, stop, temporary, until } from "./kit.js";
+
+const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
+// Of a box, and of a map.
+const box = { "time.frames_per_slide": 100_000, "time.warmup_frames": 0, "surrogate.table_nodes": "[17, 17, 17]", "flow.steps": 20 };
+const map = { "camera.orthographic": true };
+const scenes = { box: { scene: "configs/abc.toml", changes: box }, map: { scene: "configs/double_gyre.toml", changes: map } };
+const stages = {};
+let browser;
+
+async function stage(name, options) {
+  const folder = temporary();
+  const [endpoint, commands] = [`ipc://${folder}/frames`, `${folder}/commands`];
+  const publisher = startPublisher(endpoint, folder, { ...options, more: [`--steer=ipc://${commands}`] });
+  const dashboard = await startDashboard(endpoint, folder, 0, TOKEN, [`--steer=${commands}.connection`]);
+  const records = () => readFileSync(path.join(folder, "run/records.jsonl"), "utf8").split("\n").slice(0, -1).map((line) => JSON.parse(line));
+  stages[name] = { folder, endpoint, publisher, dashboard, records, address: (token) => `http://127.0.0.1:${dashboard.port}/?token=${token}` };
+}
+
+before(async () => {
+  mkdirSync(SCREENSHOTS, { recursive: true });
+  browser = await launch();
+  for (const [name, options] of Object.entries(scenes)) await stage(name, options);
+});
+
+after(async () => {
+  await browser?.close();
+  for (const { publisher, dashboard } of Object.values(stages)) for (const child of [publisher, dashboard?.child]) if (child) await stop(child);
+});
+
+let complaints;
+beforeEach(() => { complaints = []; });
+
+async function open(address) {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, permissions: ["clipboard-read", "clipboard-write"] });
+  const page = await context.newPage();
+  page.on("console", (message) => { if (["error", "warning"].includes(message.type())) complaints.push(message.text()); });
+  page.on("pageerror", (error) => complaints.push(String(error)));
+  await page.goto(address);
+  await until("a picture", async () => /\d/.test(await page.textContent("#position")));
+  return page;
+}
+
+async function steered(name, work) {
+  const page = await open(stages[name].address(TOKEN));
+  await until("the controls", () => page.isVisible("#pause"));
+  await work(page, stages[name]);
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+}
+
+const newest = ({ records }) => records().at(-1);
+const camera = (where) => newest(where).camera;
+const away = ({ eye, look_at: at }) => eye.map((value, k) => value - at[k]);
+const close = (a, b) => a.every((value, k) => Math.abs(value - b[k]) <= 1e-9 * (1 + Math.abs(b[k])));
+
+/** The first record with a command of these keys after `frame`. */
+const commanded = (where, frame, keys) => until(`a record with ${keys}`, () => where.records().find((record) => record.frame > frame && record.commands.some(({ set }) => String(Object.keys(set)) === String(keys))), 60_000);
+
+/** Drags by shares of the picture. */
+async function drag(page, across, down, button = "left") {
+  const box = await page.locator("#frame").boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  await page.mouse.move(x, y);
+  await page.mouse.down({ button });
+  await page.mouse.move(x + across * box.width, y + down * box.height, { steps: 5 });
+  await page.mouse.up({ button });
+}
+
+/** The camera once it stands still. */
+async function settled(where, page) {
+  await page.waitForTimeout(500);
+  const { frame } = newest(where);
+  await until("two more frames", () => newest(where).frame > frame + 2);
+  return camera(where);
+}
+
+test("a drag turns the camera of the next record about its point", async () => {
+  await steered("box", async (page, where) => {
+    const [from, { frame }] = [camera(where), newest(where)];
+    await drag(page, 0.1, 0.05);
+    const record = await commanded(where, frame, ["camera"]);
+    assert.ok(!close(record.camera.eye, from.eye) && close(record.camera.look_at, from.look_at));
+    const to = await settled(where, page);
+    assert.ok(Math.abs(Math.hypot(...away(to)) / Math.hypot(...away(from)) - 1) < 1e-9);
+    // To the right by a tenth of the width: 18 degrees about `up`.
+    const azimuth = ([x, y]) => Math.atan2(y, x);
+    assert.ok(Math.abs(azimuth(away(from)) - azimuth(away(to)) - 0.1 * Math.PI) < 0.05, `${away(from)} ${away(to)}`);
+    assert.ok(to.eye[2] > from.eye[2], "dragged down, seen from further above");
+    await until("it is told", async () => /Command \d+ is in effect: camera/.test(await page.textContent("#log")));
+    await page.screenshot({ path: path.join(SCREENSHOTS, "steering.png") });
+  });
+});
+
+test("shift and the right button move, the wheel zooms, a double click goes home", async () => {
+  await steered("box", async (page, where) => {
+    await page.dblclick("#frame");
+    const home = await settled(where, page);
+    await page.keyboard.down("Shift");
+    await drag(page, 0.1, 0);
+    await page.keyboard.up("Shift");
+    const moved = await settled(where, page);
+    assert.ok(close(away(moved), away(home)) && !close(moved.look_at, home.look_at));
+    await drag(page, -0.1, 0, "right");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+    await page.mouse.wheel(0, -200);
+    const near = await settled(where, page);
+    assert.ok(close(near.look_at, home.look_at) && Math.hypot(...away(near)) < 0.9 * Math.hypot(...away(home)));
+    await page.keyboard.press("-");
+    assert.ok(Math.hypot(...away(await settled(where, page))) > Math.hypot(...away(near)));
+    await page.keyboard.press("a");
+    assert.ok(!close(away(await settled(where, page)), away(near)));
+    await page.keyboard.press("0");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+    await page.keyboard.press("W");
+    assert.ok(!close((await settled(where, page)).look_at, home.look_at));
+    await page.click("#home");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+  });
+});
+
+test("a map is moved and zoomed, and not turned", async () => {
+  await steered("map", async (page, where) => {
+    const home = camera(where);
+    await drag(page, 0.1, -0.1);
+    const moved = await settled(where, page);
+    assert.ok(close(away(moved), away(home)) && moved.look_at[0] < home.look_at[0] && moved.look_at[1] < home.look_at[1], JSON.stringify(moved));
+    await page.mouse.wheel(0, -300);
+    const near = await settled(where, page);
+    assert.ok(near.field_of_view < moved.field_of_view && near.orthographic);
+    await page.dblclick("#frame");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+  });
+});
+
+test("a tolerance is in a later record, and one that is not accepted is refused by name", async () => {
+  await steered("box", async (page, where) => {
+    const { frame } = newest(where);
+    await page.fill("#tolerance", "0.125");
+    await page.press("#tolerance", "Enter");
+    const record = await commanded(where, frame, ["trust.tolerance"]);
+    assert.equal(record.tolerance, 0.125);
+    await page.fill("#tolerance", "-1");
+    await page.press("#tolerance", "Enter");
+    await until("it is refused", async () => /Refused: `trust.tolerance` is -1.0; accepted: a number above 0/.test(await page.textContent("#warnings")));
+    await until("two more frames", () => newest(where).frame > record.frame + 2);
+    assert.equal(newest(where).tolerance, 0.125);
+  });
+});
+
+test("a range of colours is in a later record, and on the colour bar", async () => {
+  await steered("map", async (page, where) => {
+    const { frame } = newest(where);
+    await page.fill("#high", "0.25");
+    await page.press("#high", "Enter");
+    const record = await commanded(where, frame, ["transfer"]);
+    assert.deepEqual([record.transfer.low, record.transfer.high], [0.05, 0.25]);
+    await until("the bar ends there", async () => (await page.locator("#scale-ticks span").allTextContents()).every((text) => Number(text) <= 0.25));
+    await page.fill("#low", "0.5");
+    await page.press("#low", "Enter");
+    await until("it is refused", async () => /Refused: `transfer.high` is 0.25; accepted: a finite number above transfer.low/.test(await page.textContent("#warnings")));
+  });
+});
+
+test("a pause holds the window, is said, and the view still moves", async () => {
+  await steered("map", async (page, where) => {
+    const { frame } = newest(where);
+    await page.keyboard.press("p");
+    const { slide } = await commanded(where, frame, ["paused"]);
+    await until("it is said", async () => /^The window is paused, frame/.test(await page.textContent("#state")));
+    // The run refines the picture, and then waits.
+    await until("no more frames", async () => { const before = newest(where).frame; await page.waitForTimeout(4_000); return newest(where).frame === before; }, 60_000);
+    assert.match(await page.textContent("#state"), /^The window is paused/);
+    assert.equal(await page.textContent("#warnings"), "");
+    await page.screenshot({ path: path.join(SCREENSHOTS, "paused.png") });
+    const last = newest(where);
+    await drag(page, 0.1, 0);
+    assert.equal((await commanded(where, last.frame, ["camera"])).slide, slide);
+    await page.click("#pause");
+    await until("the window moves on", () => newest(where).slide > slide + 2);
+    await until("it is said", async () => /^Following/.test(await page.textContent("#state")));
+  });
+});
+
+/** Sends a command as a page would, and returns the answer. */
+async function answer(where, token, set) {
+  const socket = new WebSocket(`ws://127.0.0.1:${where.dashboard.port}/socket?token=${token}`);
+  await new Promise((resolve) => { socket.on("open", resolve); });
+  const answered = new Promise((resolve) => {
+    socket.on("message", (data) => { const { json } = parse(data); if (json.kind === "answer") resolve(json); });
+  });
+  socket.send(JSON.stringify({ command: 7, set }));
+  const json = await answered;
+  socket.terminate();
+  return json;
+}
+
+test("who has the address for watching sees the run, and is refused by the server", async () => {
+  const where = stages.box;
+  let shared;
+  await steered("box", async (page) => {
+    await page.click("#share");
+    shared = new URL(await page.evaluate(() => navigator.clipboard.readText()));
+  });
+  const watching = shared.searchParams.get("token");
+  assert.ok(watching.length === 64 && watching !== TOKEN);
+  const page = await open(where.address(watching));
+  await until("it is said", async () => (await page.textContent("#obstacle")) === "This address only watches the run.");
+  assert.ok(!(await page.isVisible("#pause")) && !(await page.isVisible("#share")));
+  const { frame } = newest(where);
+  await drag(page, 0.2, 0.1);
+  await page.keyboard.press("p");
+  const refused = await answer(where, watching, { paused: true });
+  assert.ok(refused.command === 7 && /only watches/.test(refused.refused), JSON.stringify(refused));
+  await until("some frames", () => newest(where).frame > frame + 5);
+  assert.deepEqual(where.records().filter((record) => record.frame > frame).flatMap(({ commands }) => commands), []);
+  await page.context().close();
+  assert.ok((await answer(where, TOKEN, {})).accepted);
+});
+
+test("without a command socket the page says why", async () => {
+  const { endpoint, folder } = stages.map;
+  for (const [more, why] of [[[], /^The run is not steered: the dashboard or the run was started without --steer\.$/], [[`--steer=${folder}/none`], /^The run is not steered: its command socket cannot be reached .*none/]]) {
+    const { child, port } = await startDashboard(endpoint, temporary(), 0, TOKEN, more);
+    const page = await open(`http://127.0.0.1:${port}/?token=${TOKEN}`);
+    await until("it is said", async () => why.test(await page.textContent("#obstacle")));
+    assert.ok(!(await page.isVisible("#pause")));
+    await page.context().close();
+    await stop(child);
+  }
+});

@@ -1,0 +1,152 @@
+//! What commands do to a run.
+
+use crate::kit::program::{ridgewatch, set, start, text, until};
+use crate::kit::scene::{double_gyre, setup, write};
+use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
+use ridgewatch::steer::{Outcome, Steerer};
+use serde_json::{Value, json};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+const CAMERA: &str =
+    r#"{"eye": [0.5, 0.25, 1.0], "look_at": [0.5, 0.25, 0.1], "up": [0, 1, 0], "field_of_view": 60, "orthographic": true}"#;
+
+/// Runs a scene; `seen` gets the commands, and each frame. It ends the run by returning true.
+fn steered(setup: Setup, mut seen: impl FnMut(&Arc<Steering>, &Frame) -> bool + Send) -> (Vec<Frame>, RunReport) {
+    let steering = Arc::new(Steering::new(&setup.plan));
+    let options = RunOptions { steering: Some(Arc::clone(&steering)), threads: 2, ..RunOptions::default() };
+    let (stop, mut frames) = (AtomicBool::new(false), Vec::new());
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            if seen(&steering, &frame) {
+                stop.store(true, Ordering::Relaxed);
+            }
+            frames.push(frame);
+        }
+    };
+    let report = run(setup, &options, &mut sink, &stop).unwrap();
+    (frames, report)
+}
+
+fn command(steering: &Steering, set: Value) {
+    steering.command(set.as_object().unwrap()).unwrap();
+}
+
+fn scene(keys: &str) -> Setup {
+    setup(&double_gyre([48, 24, 4], &format!("time.tau = 10\nflow.steps = 20\nsurrogate.kind = \"table\"\n{keys}")), &[])
+}
+
+#[test]
+fn a_command_is_in_effect_and_in_the_record_of_the_next_frame() {
+    for method in ["reference", "gated", "two_level"] {
+        let setup = scene(&format!("time.frames_per_slide = 6\nrender.method = \"{method}\"\n"));
+        let camera: Value = serde_json::from_str(CAMERA).unwrap();
+        let (frames, _) = steered(setup, |steering, frame| {
+            match frame.record.frame {
+                1 => command(steering, json!({"camera": camera, "trust.tolerance": 0.25})),
+                2 => assert!(steering.command(json!({"camera": {}}).as_object().unwrap()).is_err()),
+                3 => command(steering, json!({"camera": null, "transfer": {"low": 0.01, "high": 0.02}})),
+                _ => {}
+            }
+            false
+        });
+        let records: Vec<_> = frames.iter().map(|frame| &*frame.record).collect();
+        assert_eq!(records.len(), 6, "{method}");
+        let numbers: Vec<Vec<u64>> = records.iter().map(|record| record.commands.iter().map(|command| command.number).collect()).collect();
+        assert_eq!(numbers, [vec![], vec![], vec![1], vec![], vec![2], vec![]], "{method}");
+        let given = serde_json::from_value(camera.clone()).unwrap();
+        assert_eq!((&records[2].camera, &records[3].camera), (&Some(given), &records[2].camera), "{method}");
+        assert_ne!(records[1].camera, records[2].camera);
+        assert_eq!((records[1].tolerance, records[2].tolerance, records[5].tolerance), (0.03, 0.25, 0.25));
+        // Back home, with other colours.
+        assert_eq!((&records[4].camera, records[4].scale), (&records[0].camera, records[0].scale));
+        assert_eq!((records[4].transfer.low, records[4].transfer.high), (0.01, 0.02));
+        assert_eq!(frames[4].color_bar.as_ref().unwrap().high, 0.02);
+        assert_ne!(frames[1].film.rgba, frames[2].film.rgba, "{method}: another view is another picture");
+        assert_ne!(frames[4].film.rgba, frames[0].film.rgba, "{method}: other colours are another picture");
+    }
+}
+
+/// As many samples as if the picture had begun with that camera: nothing of the former view is left in it.
+#[test]
+fn an_accumulating_picture_starts_anew_with_another_camera() {
+    let keys = "time.frames_per_slide = 8\nrender.method = \"two_level\"\n";
+    let (frames, _) = steered(scene(keys), |steering, frame| {
+        if frame.record.frame == 4 {
+            command(steering, json!({"camera": serde_json::from_str::<Value>(CAMERA).unwrap()}));
+        }
+        false
+    });
+    let samples: Vec<f64> = frames.iter().map(|frame| frame.record.picture_error.unwrap().samples_per_pixel).collect();
+    assert!(samples[4] > 3.0 * samples[0] && samples[5] < 0.5 * samples[4] && samples[7] > samples[5], "{samples:?}");
+}
+
+#[test]
+fn a_pause_holds_the_window_and_its_frames_end_until_the_next_command() {
+    let setup = scene("time.slides = 5\nrender.method = \"two_level\"\n");
+    let mut since = None;
+    let (frames, report) = steered(setup, |steering, frame| {
+        match frame.record.frame {
+            0 => command(steering, json!({"paused": true})),
+            // The last frame before the run waits: 32 after the command. A command from elsewhere comes meanwhile.
+            32 => {
+                since = Some(Instant::now());
+                let steering = Arc::clone(steering);
+                std::thread::spawn(move || {
+                    std::thread::sleep(Duration::from_millis(300));
+                    command(&steering, json!({"paused": false}));
+                });
+            }
+            33 => assert!(since.unwrap().elapsed() >= Duration::from_millis(300), "the run waits"),
+            _ => {}
+        }
+        false
+    });
+    let slides: Vec<u64> = frames.iter().map(|frame| frame.record.slide).collect();
+    assert_eq!((slides.len(), report.slides), (38, 5));
+    assert!(slides[..34].iter().all(|slide| *slide == 0) && slides[34..] == [1, 2, 3, 4], "{slides:?}");
+    let paused: Vec<_> = frames.iter().flat_map(|frame| &frame.record.commands).map(|command| command.set.paused).collect();
+    assert_eq!(paused, [Some(true), Some(false)]);
+}
+
+#[test]
+fn a_run_that_waits_for_a_command_ends_when_asked_or_when_its_time_is_up() {
+    let begin = Instant::now();
+    let keys = "time.slides = 5\nrender.method = \"reference\"\n";
+    let setup = scene(keys);
+    let steering = Arc::new(Steering::new(&setup.plan));
+    command(&steering, json!({"paused": true}));
+    let options = RunOptions { steering: Some(steering), seconds: Some(3.0), threads: 2, ..RunOptions::default() };
+    let report = run(setup, &options, &mut |_| {}, &AtomicBool::new(false)).unwrap();
+    assert_eq!((report.frames, report.slides, report.interrupted), (32, 1, false));
+    assert!(begin.elapsed() >= Duration::from_secs(3));
+    let (frames, report) = steered(scene(keys), |steering, frame| {
+        command(steering, json!({"paused": true}));
+        frame.record.frame == 2
+    });
+    assert!(frames.len() == 3 && report.interrupted);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_program_is_steered_by_its_connection_file_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = write(folder.path(), &double_gyre([32, 16, 1], "time.tau = 10\ntime.slides = 1000\nrender.method = \"reference\"\n"));
+    let out = folder.path().join("run");
+    let endpoint = format!("ipc://{}", folder.path().join("commands").display());
+    let file = folder.path().join("commands.connection");
+    let mut replay = ridgewatch(["replay", &scene, &format!("--steer={endpoint}"), "--out", text(&out)]);
+    let running = start(replay.args(set(&["flow.steps=20", "publish.preview=false"])));
+    until("a connection file", || file.exists());
+    let mut steerer = Steerer::connect(&file).await.unwrap();
+    let outcome = steerer.command(json!({"trust.tolerance": 0.125, "paused": true}).as_object().unwrap()).await.unwrap();
+    assert!(matches!(outcome, Outcome::Accepted(state) if state.paused), "{outcome:?}");
+    let records = || std::fs::read_to_string(out.join("records.jsonl")).unwrap_or_default();
+    until("the command in a record", || records().contains(r#""commands":[{"number":1,"set":{"trust.tolerance":0.125,"paused":true}}]"#));
+    running.signal(libc::SIGTERM);
+    let outcome = running.wait_at_most(Duration::from_secs(60));
+    assert!(outcome.stderr.contains(&format!("commands at {endpoint}, with the key in {}", file.display())), "{}", outcome.stderr);
+    assert!(!file.exists(), "the key goes with the run");
+    let mut replay = ridgewatch(["replay", &scene, "--steer=udp://127.0.0.1:1", "--out", text(&folder.path().join("no"))]);
+    crate::kit::program::run(&mut replay).refused(2, &["udp://127.0.0.1:1", "neither tcp:// nor ipc://"]);
+}
