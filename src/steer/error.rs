@@ -8,7 +8,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum SteerError {
     /// The socket cannot listen.
-    #[error("command socket `{endpoint}`: {source}")]
+    #[error("command socket `{endpoint}`: {source} (--steer=ENDPOINT: private, ipc://PATH or tcp://HOST:PORT)")]
     Bind {
         /// As given.
         endpoint: String,
