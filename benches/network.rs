@@ -5,6 +5,7 @@
 
 use burn::backend::Flex;
 use burn::tensor::{Tensor, TensorData};
+use ridgewatch::field::UnitPoint;
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
     Architecture, Average, Encoding, Fused, Model, Network, NetworkSettings, Objective, PlannedStep, Step, operation_step, stock_step,
@@ -18,8 +19,8 @@ fn samples(count: usize) -> Samples {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 40) as f32 / (1_u64 << 24) as f32
     };
-    let points: Vec<[f32; 3]> = (0..count).map(|_| std::array::from_fn(|_| random())).collect();
-    let log_stretch = points.iter().map(|p| (9.0 * p[0]).sin() * (7.0 * p[1]).cos() + p[2]).collect();
+    let points: Vec<UnitPoint> = (0..count).map(|_| UnitPoint(std::array::from_fn(|_| random()))).collect();
+    let log_stretch = points.iter().map(|p| (9.0 * p.0[0]).sin() * (7.0 * p.0[1]).cos() + p.0[2]).collect();
     Samples { points, log_stretch, ..Samples::default() }
 }
 
@@ -51,7 +52,7 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
     println!("{name}: {} parameters, encoded {}", shape.parameters(), shape.encoded());
 
     let device = Default::default();
-    let flat: Vec<f32> = samples.points[..inference].iter().flat_map(|p| p[..dimensions].to_vec()).collect();
+    let flat: Vec<f32> = samples.points[..inference].iter().flat_map(|p| p.0[..dimensions].to_vec()).collect();
     let points = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [inference, dimensions]), &device);
     let network: &Network<Flex> = &model.module;
     let times = compare(

@@ -1,7 +1,7 @@
 //! What the renderer itself costs a query: answers are nearly free here.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint};
 use ridgewatch::render::{CameraSettings, LogStretch, RenderSettings, Renderer, Scene, TransferSettings};
 use std::hint::black_box;
 use std::sync::atomic::AtomicBool;
@@ -10,10 +10,10 @@ use std::sync::atomic::AtomicBool;
 struct Ridges;
 
 impl LogStretch for Ridges {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         traced.fill(true);
         for (s, p) in log_stretch.iter_mut().zip(points) {
-            let distance = (8.0 * p[0] + 3.0 * (5.0 * p[1]).fract()).fract() - 0.5;
+            let distance = (8.0 * p.0[0] + 3.0 * (5.0 * p.0[1]).fract()).fract() - 0.5;
             *s = 1.0 - 8.0 * distance.abs();
         }
     }

@@ -4,9 +4,9 @@
 // A benchmark talks to its user on standard output.
 #![allow(clippy::print_stdout)]
 
-use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
+use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{
     Boundary, Extras, FlowMap, Integrator, Order, Precision, Traced, Tracer, VelocitySource, cpu_tracer, scalar_tracer, tracer_in_order,
 };
@@ -22,7 +22,7 @@ fn map(tau: f64, steps: usize, precision: Precision, boundary: Boundary) -> Flow
 }
 
 /// Uniform points in no order.
-fn scattered(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+fn scattered(domain: &Domain, count: usize) -> Vec<DomainPoint> {
     let mut state = 0x2545_f491_4f6c_dd1du64;
     let mut uniform = || {
         state ^= state << 13;
@@ -30,11 +30,11 @@ fn scattered(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
         state ^= state << 17;
         (state >> 40) as f32 / (1u32 << 24) as f32
     };
-    (0..count).map(|_| domain.from_unit([uniform(), uniform(), uniform()])).collect()
+    (0..count).map(|_| domain.from_unit(UnitPoint([uniform(), uniform(), uniform()]))).collect()
 }
 
 /// Samples a second of each tracer: medians over rounds in which all take their turn.
-fn rates(tracers: &[&dyn Tracer], seeds: &[&[[f32; 3]]]) -> Vec<f64> {
+fn rates(tracers: &[&dyn Tracer], seeds: &[&[DomainPoint]]) -> Vec<f64> {
     let mut seconds = vec![Vec::new(); tracers.len()];
     let mut out = Traced::default();
     for round in 0..=ROUNDS {

@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::backend::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, TraceAll, Tuning};
-use ridgewatch::field::Window;
 use ridgewatch::field::turbulence::Turbulence;
+use ridgewatch::field::{DomainPoint, UnitPoint, Window};
 use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::Trace;
@@ -34,8 +34,8 @@ fn map(steps: usize) -> FlowMap {
 fn scene(tracer: &CudaTracer, width: usize, height: usize, seed: u64) -> Scene {
     let domain = tracer.host().domain();
     let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
-    let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
-    let seeds: Vec<[f32; 3]> = unit.map(|u| domain.from_unit(u)).collect();
+    let unit = (0..64 * 64 * 16).map(|i| UnitPoint([at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]));
+    let seeds: Vec<DomainPoint> = unit.map(|u| domain.from_unit(u)).collect();
     let mut probes = ridgewatch::flow::Traced::default();
     tracer.trace(&seeds, Extras::default(), &mut probes).unwrap();
     let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / TAU as f32).collect();

@@ -13,6 +13,7 @@
 use ridgewatch::backend::cuda::{Gpu, GpuSettings};
 use ridgewatch::backend::{CudaDevice, Device, Storage, TracedOnce, WhenLost, stratified_points};
 use ridgewatch::config::SceneFile;
+use ridgewatch::field::DomainPoint;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
 use ridgewatch::run::{CheckpointRecord, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, run};
@@ -72,7 +73,7 @@ fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let mut setup = Setup::new(settings.clone()).unwrap();
     let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
     let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
-    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
+    let seeds: Vec<DomainPoint> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
     let TracedOnce { flow, traced, .. } = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).unwrap();
     let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
     TransferSettings::default().scaled_to(&ftle)

@@ -11,6 +11,7 @@ use ridgewatch::backend::{
     SurrogateRequest, WhenLost, audit, render_on_cpu,
 };
 use ridgewatch::config::SceneFile;
+use ridgewatch::field::{DomainPoint, UnitPoint};
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::Renderer;
 use ridgewatch::run::{Event, FrameRecord, RunError, RunOptions, Setup, StageSeconds, run_on};
@@ -114,7 +115,7 @@ impl Trace for BreakingTracer {
     fn flow(&self) -> &dyn Tracer {
         &*self.host
     }
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         self.line.call("tracing seeds")?;
         Tracer::trace(&*self.host, seeds, extras, out);
         self.line.call("reading a trace").inspect_err(|_| out.log_stretch.fill(1e30))
@@ -142,7 +143,7 @@ impl SurrogateDevice for OnLine {
         Ok(BreakingTable::new(line, Table::trace(&tracer.host, nodes)?))
     }
 
-    fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         if let Some(table) = &frozen.table {
             table.0.line.call("looking up in a table")?;
             table.0.values.interpolate(points, out);

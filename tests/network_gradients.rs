@@ -6,6 +6,7 @@ mod network_support;
 
 use network_support::reference::{Kernel, Reference, Rounding, labels, norm};
 use network_support::{Case, cases, uniform_points};
+use ridgewatch::field::UnitPoint;
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
     Architecture, Average, Fused, Model, Objective, PlannedStep, Row, Step, Target, autodiff_gradient, operation_step, row, stock_step,
@@ -171,8 +172,8 @@ fn predictions_of_all_ways_agree() {
         let shape = std::sync::Arc::new(model.shape.clone());
         // Not a multiple of any tile, with the corners of the domain.
         let mut points = uniform_points(8, 1237);
-        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]]);
-        let rows: Vec<Row> = points.iter().map(|&[x, y, z]| row([x, y, z], [z, x])).collect();
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]].map(UnitPoint));
+        let rows: Vec<Row> = points.iter().map(|&point| row(point, [point.0[2], point.0[0]])).collect();
         let flat: Vec<f32> = rows.iter().flat_map(|row| shape.axes.iter().map(|&a| row[a])).collect();
         let tensor = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [rows.len(), shape.inputs()]), &Default::default());
         let stock = model.module.forward(&shape, tensor.clone()).into_data().to_vec::<f32>().unwrap();

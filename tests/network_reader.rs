@@ -6,6 +6,7 @@
 mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
+use ridgewatch::field::UnitPoint;
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target, Times};
 use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, SurrogateSettings, build};
@@ -14,7 +15,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// The example's predictions at unit points, or its error message.
-fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<f32>, String> {
+fn evaluated(checkpoint: &Path, points: &[UnitPoint], times: &str) -> Result<Vec<f32>, String> {
     let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/evaluate_network.py");
     let mut child = Command::new(python)
@@ -24,7 +25,7 @@ fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z} {times}\n")).collect();
+    let text: String = points.iter().map(|UnitPoint([x, y, z])| format!("{x} {y} {z} {times}\n")).collect();
     // The script reads everything before it writes anything, or it fails and reads nothing.
     let written = child.stdin.take().unwrap().write_all(text.as_bytes());
     let output = child.wait_with_output().unwrap();
@@ -69,7 +70,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);
-        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]]);
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]].map(UnitPoint));
         if !times.is_empty() {
             surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30)).unwrap();
         }

@@ -5,6 +5,7 @@
 mod network_support;
 
 use network_support::{DoubleGyre, rms, traced, uniform_points};
+use ridgewatch::field::UnitPoint;
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
 use ridgewatch::surrogate::{CheckpointError, HostSurrogate, Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace, build};
@@ -115,13 +116,13 @@ fn samples_without_a_value_are_dropped_and_counted() {
     let mut samples = traced(&tracer, uniform_points(1, 5_000), false);
     samples.log_stretch[3] = f32::NAN;
     samples.log_stretch[77] = f32::INFINITY;
-    samples.points[100][1] = f32::NAN;
+    samples.points[100].0[1] = f32::NAN;
     let mut network = surrogate(Kind::Network, &small(), &tracer);
     let learned = network.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 50).unwrap();
     assert_eq!((learned.dropped, learned.rollbacks, learned.steps), (3, 0, 50));
     assert!(learned.loss.unwrap().is_finite());
     assert!(rms(&network, &traced(&tracer, uniform_points(2, 500), false)).is_finite());
-    let nothing = Samples { points: vec![[0.5; 3]], log_stretch: vec![f32::NAN], ..Samples::default() };
+    let nothing = Samples { points: vec![UnitPoint([0.5; 3])], log_stretch: vec![f32::NAN], ..Samples::default() };
     let learned = network.learn(&ReplayBuffer::holding(&nothing), f64::INFINITY, 50).unwrap();
     assert_eq!((learned.dropped, learned.steps, learned.loss), (1, 0, None));
 }

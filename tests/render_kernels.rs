@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
 use ridgewatch::backend::{DeviceError, residuals, stratified_points};
-use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, UnitPoint, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
     cpu_tracer,
@@ -142,11 +142,11 @@ fn rays_and_colours_are_the_same_numbers() {
 struct Waves;
 
 impl LogStretch for Waves {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         for (i, p) in points.iter().enumerate() {
-            let value = (7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos();
-            log_stretch[i] = if p[0] > 1.8 && p[1] < 0.3 { f32::NAN } else { value };
-            traced[i] = p[1] > 0.5;
+            let value = (7.0 * p.0[0] + 3.0 * p.0[2]).sin() * (9.0 * p.0[1]).cos();
+            log_stretch[i] = if p.0[0] > 1.8 && p.0[1] < 0.3 { f32::NAN } else { value };
+            traced[i] = p.0[1] > 0.5;
         }
     }
 }
@@ -258,8 +258,8 @@ fn parts_of_a_pixel_merge_to_the_whole() {
 fn the_gate_trusts_the_same_points() {
     let gate = some_gate();
     let mut random = uniform(3);
-    let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| std::array::from_fn(|_| 1.2 * random() - 0.1)).collect();
-    points.extend([[0.0; 3], [1.0; 3]]);
+    let mut points: Vec<UnitPoint> = (0..20_000).map(|_| UnitPoint(std::array::from_fn(|_| 1.2 * random() - 0.1))).collect();
+    points.extend([[0.0; 3], [1.0; 3]].map(UnitPoint));
     let mut input = bytes(&[5_i32, 3, 4]);
     input.extend(bytes(gate.cells()));
     input.extend(bytes(&[points.len() as u32]));
@@ -284,8 +284,8 @@ impl Tracer for Plane {
     fn steps(&self) -> usize {
         1
     }
-    fn trace(&self, seeds: &[[f32; 3]], _: Extras, out: &mut Traced) {
-        out.log_stretch = seeds.iter().map(|p| (5.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2]).collect();
+    fn trace(&self, seeds: &[DomainPoint], _: Extras, out: &mut Traced) {
+        out.log_stretch = seeds.iter().map(|p| (5.0 * p.0[0]).sin() + (3.0 * p.0[1]).cos() * p.0[2]).collect();
     }
 }
 
@@ -298,8 +298,8 @@ fn tables_are_looked_up_alike() {
     for (domain, dimensions) in [(domain(), 3), (Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), 2)] {
         let table = Table::trace(&Plane(domain), [9, 5, 6]).unwrap();
         let mut random = uniform(5);
-        let mut points: Vec<[f32; 3]> = (0..10_000).map(|_| std::array::from_fn(|_| 1.2 * random() - 0.1)).collect();
-        points.extend([[0.0; 3], [1.0; 3]]);
+        let mut points: Vec<UnitPoint> = (0..10_000).map(|_| UnitPoint(std::array::from_fn(|_| 1.2 * random() - 0.1))).collect();
+        points.extend([[0.0; 3], [1.0; 3]].map(UnitPoint));
         let mut expected = vec![0.0; points.len()];
         table.interpolate(&points, &mut expected);
         let mut input = table_bytes(&table, dimensions);
@@ -363,7 +363,7 @@ fn missing_cells_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
     }
     for &z in &middles[2] {
         for &y in &middles[1] {
-            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_missing([x as f32, y as f32, z as f32]))));
+            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_missing(DomainPoint([x as f32, y as f32, z as f32])))));
         }
     }
     out
@@ -391,8 +391,8 @@ fn some_gate() -> Gate {
     let mut random = uniform(7);
     let residuals: Vec<Residual> = (0..4000)
         .map(|_| {
-            let point = [random(), random(), random()];
-            Residual { point, optical: if point[0] + point[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
+            let point = UnitPoint([random(), random(), random()]);
+            Residual { point, optical: if point.0[0] + point.0[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
         })
         .collect();
     map.observe(None, &residuals);
@@ -408,12 +408,12 @@ fn the_same_one_answers_at_every_point() {
     for (periodic, spent) in [(false, false), (true, true)] {
         let tracer = holed(periodic);
         let mut random = uniform(8);
-        let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| domain.from_unit([random(), random(), random()])).collect();
+        let mut points: Vec<DomainPoint> = (0..20_000).map(|_| domain.from_unit(UnitPoint([random(), random(), random()]))).collect();
         // Outside the domain, corners, and nodes of the velocity grid themselves.
-        points.extend((0..5000).map(|_| domain.from_unit([(); 3].map(|()| 1.8 * random() - 0.4))));
-        points.extend([[0.0; 3], [2.0, 1.0, 1.0]]);
+        points.extend((0..5000).map(|_| domain.from_unit(UnitPoint([(); 3].map(|()| 1.8 * random() - 0.4)))));
+        points.extend([[0.0; 3], [2.0, 1.0, 1.0]].map(DomainPoint));
         let nodes = axes(periodic);
-        points.extend((0..77).map(|i| [nodes[0][i % 11] as f32, nodes[1][i % 6] as f32, nodes[2][i % 7] as f32]));
+        points.extend((0..77).map(|i| DomainPoint([nodes[0][i % 11] as f32, nodes[1][i % 6] as f32, nodes[2][i % 7] as f32])));
         let mut input = answer_setup_bytes(&domain, spent, Some(&gate), &missing_cells_bytes(&*tracer, periodic), &table);
         input.extend(bytes(&[points.len() as u32]));
         input.extend(bytes(&points));
@@ -435,7 +435,7 @@ fn the_same_one_answers_at_every_point() {
             if expected > 0 {
                 let mut predicted = [0.0];
                 table.interpolate(&[unit], &mut predicted);
-                assert_eq!(values[..3], unit, "{point:?}");
+                assert_eq!(values[..3], unit.0, "{point:?}");
                 assert!((values[3] - predicted[0]).abs() <= 1e-6, "{point:?}");
             }
         }
@@ -451,7 +451,7 @@ impl Predict for Given {
     fn name(&self) -> &'static str {
         "given"
     }
-    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(&self, _: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         out.copy_from_slice(&self.0);
         Ok(())
     }
@@ -497,7 +497,7 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
     let (mut number, mut points, mut peak) = (0, 0.0, f64::NEG_INFINITY);
     for (cell, &drawn) in strata.drawn.iter().enumerate() {
         for _ in 0..drawn {
-            assert_eq!(read::<[f32; 3]>(&mut output, 1)[0], unit[number], "point {number}");
+            assert_eq!(read::<UnitPoint>(&mut output, 1)[0], unit[number], "point {number}");
             number += 1;
         }
         // Figures of the points themselves follow the sums.
@@ -517,7 +517,7 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
 #[cfg(feature = "cuda")]
 fn the_same_labels_are_kept() {
     let mut random = uniform(9);
-    let points: Vec<[f32; 3]> = (0..20_000).map(|_| std::array::from_fn(|_| random())).collect();
+    let points: Vec<DomainPoint> = (0..20_000).map(|_| DomainPoint(std::array::from_fn(|_| random()))).collect();
     for shift in [0_u32, 1, 5, 32] {
         let mut input = bytes(&[shift, points.len() as u32]);
         input.extend(bytes(&points));
@@ -536,7 +536,7 @@ struct Gated<'a> {
 }
 
 impl LogStretch for Gated<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         for (i, &p) in points.iter().enumerate() {
             let unit = domain().to_unit(p);
             traced[i] = false;
@@ -546,7 +546,7 @@ impl LogStretch for Gated<'_> {
                 self.over_budget += u64::from(self.gate.is_some_and(|gate| !gate.trusts(unit)));
                 self.table.interpolate(&[unit], &mut log_stretch[i..=i]);
             } else {
-                (log_stretch[i], traced[i]) = ((7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos(), true);
+                (log_stretch[i], traced[i]) = ((7.0 * p.0[0] + 3.0 * p.0[2]).sin() * (9.0 * p.0[1]).cos(), true);
             }
         }
     }

@@ -3,6 +3,7 @@
 use cudarc::driver::result;
 use ridgewatch::backend::cuda::driver_error;
 use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, TraceAll};
+use ridgewatch::field::{DomainPoint, UnitPoint};
 use ridgewatch::flow::Extras;
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::Trace;
@@ -28,8 +29,8 @@ impl Collisions {
     pub fn new(gpu: &Arc<Gpu>, tracer: &CudaTracer, most: usize) -> Result<Self, Box<dyn Error>> {
         let (domain, tau) = (tracer.host().domain(), tracer.host().tau());
         let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
-        let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
-        let seeds: Vec<[f32; 3]> = unit.map(|u| domain.from_unit(u)).collect();
+        let unit = (0..64 * 64 * 16).map(|i| UnitPoint([at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]));
+        let seeds: Vec<DomainPoint> = unit.map(|u| domain.from_unit(u)).collect();
         let mut probes = ridgewatch::flow::Traced::default();
         tracer.trace(&seeds, Extras::default(), &mut probes)?;
         let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / tau as f32).collect();

@@ -33,7 +33,7 @@ mod bench {
     };
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
-    use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
+    use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, UnitPoint, Window};
     use ridgewatch::flow::{
         Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource,
     };
@@ -79,7 +79,7 @@ mod bench {
     }
 
     /// Uniform points in random order.
-    fn scattered(domain: &Domain, count: usize, seed: u64) -> Vec<[f32; 3]> {
+    fn scattered(domain: &Domain, count: usize, seed: u64) -> Vec<DomainPoint> {
         let mut state = 0x2545_f491_4f6c_dd1du64 ^ (seed << 17);
         let mut uniform = || {
             state ^= state << 13;
@@ -87,7 +87,7 @@ mod bench {
             state ^= state << 17;
             (state >> 40) as f32 / (1u32 << 24) as f32
         };
-        (0..count).map(|_| domain.from_unit([uniform(), uniform(), uniform()])).collect()
+        (0..count).map(|_| domain.from_unit(UnitPoint([uniform(), uniform(), uniform()]))).collect()
     }
 
     /// Seeds and results on the device.
@@ -99,8 +99,8 @@ mod bench {
     }
 
     impl Batch {
-        fn new(gpu: &Gpu, points: &[[f32; 3]]) -> Result<Self, DeviceError> {
-            Self::of(gpu, gpu.upload("seeds", points)?)
+        fn new(gpu: &Gpu, points: &[DomainPoint]) -> Result<Self, DeviceError> {
+            Self::of(gpu, gpu.upload("seeds", bytemuck::cast_slice(points))?)
         }
 
         fn of(gpu: &Gpu, seeds: Buffer<[f32; 3]>) -> Result<Self, DeviceError> {
@@ -166,7 +166,7 @@ mod bench {
 
     /// Points where the log-stretch is known: traced in f64 with 880 steps.
     struct Truth {
-        points: Vec<[f32; 3]>,
+        points: Vec<DomainPoint>,
         batch: Batch,
         log_stretch: Vec<f64>,
         peak: f64,
@@ -227,8 +227,8 @@ mod bench {
                     seconds.push(begun.elapsed().as_secs_f64());
                 }
                 seconds.sort_by(f64::total_cmp);
-                let unit: Vec<[f32; 3]> = points.iter().map(|&p| domain.to_unit(p)).collect();
-                let asked = self.gpu.upload("points", &unit)?;
+                let unit: Vec<UnitPoint> = points.iter().map(|&p| domain.to_unit(p)).collect();
+                let asked = self.gpu.upload::<[f32; 3]>("points", bytemuck::cast_slice(&unit))?;
                 let answers = self.gpu.alloc::<f32>("answers", unit.len())?;
                 // SAFETY: both buffers hold an entry a point.
                 unsafe { table.predict(asked.address(), unit.len(), answers.address())? };
@@ -236,15 +236,16 @@ mod bench {
                 answers.read(&mut found)?;
                 // Random points, and runs of 32 neighbours a fifth of a cell apart, as along rays of a picture.
                 let many = 1usize << 24;
-                let random = scattered(&Domain::cuboid([0.0; 3], [1.0; 3]), many, 5);
-                let coherent: Vec<[f32; 3]> = (0..many)
+                let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
+                let random: Vec<UnitPoint> = scattered(&cube, many, 5).into_iter().map(|p| cube.to_unit(p)).collect();
+                let coherent: Vec<UnitPoint> = (0..many)
                     .map(|i| {
                         let (p, lane) = (random[i / 32], (i % 32) as f32);
-                        std::array::from_fn(|k| p[k] + lane * [0.2, 0.1, 0.05][k] / SHAPE[k] as f32)
+                        UnitPoint(std::array::from_fn(|k| p.0[k] + lane * [0.2, 0.1, 0.05][k] / SHAPE[k] as f32))
                     })
                     .collect();
-                let rate = |points: &[[f32; 3]]| -> Outcome<f64> {
-                    let asked = self.gpu.upload("points", points)?;
+                let rate = |points: &[UnitPoint]| -> Outcome<f64> {
+                    let asked = self.gpu.upload::<[f32; 3]>("points", bytemuck::cast_slice(points))?;
                     let answers = self.gpu.alloc::<f32>("answers", points.len())?;
                     let mut times = Vec::new();
                     for _ in 0..ROUNDS {

@@ -7,6 +7,7 @@
 use super::DeviceError;
 use super::router::push_sample;
 use rayon::prelude::*;
+use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, Traced};
 use ridgewatch_render::Transfer;
 use ridgewatch_render::rng::{philox, unit};
@@ -24,8 +25,8 @@ pub(super) fn draws(seed: u64, stream: u64) -> ([u32; 2], [u32; 3]) {
     ([seed as u32, (seed >> 32) as u32], [stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION])
 }
 
-/// Draws the points of all strata in unit coordinates, cell by cell: `strata.drawn[cell]` uniform points in each cell.
-pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3]> {
+/// Draws the points of all strata, cell by cell: `strata.drawn[cell]` uniform points in each cell.
+pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<UnitPoint> {
     let cells = strata.shape;
     let (key, [low, high, dimension]) = draws(seed, stream);
     let mut first = 0;
@@ -37,14 +38,14 @@ pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3
         .collect();
     let in_cell = |&(cell, first, count): &(usize, u32, u32)| {
         let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
-        (first..first + count).map(move |number| -> [f32; 3] {
+        (first..first + count).map(move |number| {
             let words = philox([number, low, high, dimension], key);
-            std::array::from_fn(|k| {
+            UnitPoint(std::array::from_fn(|k| {
                 let at = |offset: f32| (index[k] as f32 + offset) / cells[k] as f32;
                 let drawn = at(unit(words[k]));
                 // Rounding moves about one point in a million across the edge of its cell; the cell's centre replaces it.
                 if (drawn * cells[k] as f32) as usize == index[k] { drawn } else { at(0.5) }
-            })
+            }))
         })
     };
     cell_starts.par_iter().with_min_len(64).flat_map_iter(in_cell).collect()
@@ -62,13 +63,13 @@ pub struct Audit {
     pub mean_lifetime_share: f64,
 }
 
-/// Traces points in unit coordinates. `extras` selects the arrival points and Jacobians of the samples.
+/// Traces points. `extras` selects the arrival points and Jacobians of the samples.
 ///
 /// # Errors
 /// The tracer's device fails or lacks memory.
-pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Audit, DeviceError> {
+pub fn trace(tracer: &dyn Trace, unit: &[UnitPoint], extras: Extras) -> Result<Audit, DeviceError> {
     let domain = tracer.flow().domain();
-    let points: Vec<[f32; 3]> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
+    let points: Vec<DomainPoint> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
     let mut traced = Traced::default();
     tracer.trace(&points, extras, &mut traced)?;
     // Chunks are summed in order, so that the result does not depend on the number of threads.
@@ -202,8 +203,8 @@ mod tests {
         let points = stratified_points(&Strata::even(cells, 5), 7, 9);
         let mut count = [0; 12];
         for p in &points {
-            assert!(p.iter().all(|u| (0.0..1.0).contains(u)));
-            count[(p[1] * 3.0) as usize * 4 + (p[0] * 4.0) as usize] += 1;
+            assert!(p.0.iter().all(|u| (0.0..1.0).contains(u)));
+            count[(p.0[1] * 3.0) as usize * 4 + (p.0[0] * 4.0) as usize] += 1;
         }
         assert_eq!(count, [5; 12]);
         assert_ne!(points, stratified_points(&Strata::even(cells, 5), 7, 10), "another frame draws other points");

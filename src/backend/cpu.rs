@@ -8,6 +8,7 @@ use super::router::QueryRouter;
 use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
 use rayon::prelude::*;
 use ridgewatch_base::progress;
+use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement};
 use ridgewatch_render::{Film, RenderStats, Renderer};
@@ -113,7 +114,7 @@ impl HostPicture {
             }
             progress::mark();
             let first = part * AT_ONCE;
-            let points: Vec<[f32; 3]> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
+            let points: Vec<UnitPoint> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;
         }
         Ok(Some(self.nodes.insert(Nodes::new(shape, Arc::new(values))).clone()))
@@ -130,7 +131,7 @@ fn refine_on_cpu(
     let missing_surrogate = || DeviceError::Unsupported { what: "a smooth frame without a surrogate".into() };
     let nodes = picture.nodes(frame.surrogate.ok_or_else(missing_surrogate)?, smooth.nodes, frame.stop)?;
     let flow = frame.tracer.flow();
-    let is_missing = |point: [f32; 3]| flow.is_missing(point);
+    let is_missing = |point: DomainPoint| flow.is_missing(point);
     let nothing_trusted = Gate::uniform(false);
     let routing = Routing { gate: &nothing_trusted, trace_budget: None, ..frame.routing };
     let tracer = Interruptible::new(frame.tracer, frame.stop);

@@ -6,6 +6,7 @@ use super::settings::{DeviceChoice, DeviceSettings};
 #[cfg(feature = "cuda")]
 use super::settings::{Storage, WhenLost};
 use super::{BackendError, DeviceError};
+use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 #[cfg(feature = "cuda")]
 use ridgewatch_surrogate::Trace;
@@ -90,12 +91,12 @@ impl Device {
         !matches!(self, Self::Cpu { .. })
     }
 
-    /// Traces one set of seeds (domain coordinates) at the start time `t0`. If the device cannot and the settings allow the CPU to take over, the CPU
+    /// Traces one set of seeds at the start time `t0`. If the device cannot and the settings allow the CPU to take over, the CPU
     /// traces them and a note says why.
     ///
     /// # Errors
     /// The flow map is invalid, or the device fails and the settings do not allow the CPU to take over.
-    pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Result<TracedOnce, BackendError> {
+    pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Result<TracedOnce, BackendError> {
         let mut traced = Traced::default();
         #[cfg_attr(not(feature = "cuda"), allow(unused_mut))] // no other device fails
         let mut note = None;

@@ -2,6 +2,7 @@
 
 use super::DeviceError;
 use ridgewatch_base::progress;
+use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, Traced, Tracer};
 use ridgewatch_surrogate::Trace;
 use std::sync::Mutex;
@@ -47,7 +48,7 @@ impl Trace for Interruptible<'_> {
         self.tracer.flow()
     }
 
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         let mut done = 0;
         let mut piece = Traced::default();
         *out = Traced::default();
@@ -80,7 +81,7 @@ impl Trace for Interruptible<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ridgewatch_field::Domain;
+    use ridgewatch_field::{Domain, DomainPoint};
 
     /// Log-stretch = x; asks for a stop once it has traced `limit` seeds.
     struct Counting<'a> {
@@ -103,20 +104,20 @@ mod tests {
         fn steps(&self) -> usize {
             1
         }
-        fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+        fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) {
             let mut traced = self.traced.lock().unwrap();
             *traced += seeds.len();
             self.stop.fetch_or(*traced >= self.limit, Ordering::Relaxed);
-            out.log_stretch = seeds.iter().map(|s| s[0]).collect();
+            out.log_stretch = seeds.iter().map(|s| s.0[0]).collect();
             out.lifetime_share = vec![1.0; seeds.len()];
             out.arrival = if extras.arrival { seeds.to_vec() } else { Vec::new() };
         }
     }
 
-    fn traced(limit: usize) -> (Vec<[f32; 3]>, Traced) {
+    fn traced(limit: usize) -> (Vec<DomainPoint>, Traced) {
         let stop = AtomicBool::new(false);
         let counting = Counting { domain: Domain::cuboid([0.0; 3], [1.0; 3]), traced: Mutex::new(0), limit, stop: &stop };
-        let seeds: Vec<[f32; 3]> = (0..100_000).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let seeds: Vec<DomainPoint> = (0..100_000).map(|i| DomainPoint([i as f32, 0.0, 0.0])).collect();
         let mut out = Traced::default();
         Interruptible::new(&counting, &stop).trace(&seeds, Extras { arrival: true, jacobian: false }, &mut out).unwrap();
         (seeds, out)
@@ -126,7 +127,7 @@ mod tests {
     fn parts_join_to_the_whole() {
         let (seeds, out) = traced(usize::MAX);
         assert_eq!(out.arrival, seeds);
-        assert!(out.log_stretch.iter().zip(&seeds).all(|(s, seed)| *s == seed[0]));
+        assert!(out.log_stretch.iter().zip(&seeds).all(|(s, seed)| *s == seed.0[0]));
         assert_eq!((out.lifetime_share.len(), out.log_stretch_f64.len(), out.jacobian.len()), (seeds.len(), 0, 0));
     }
 

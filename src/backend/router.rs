@@ -12,7 +12,7 @@
 //! queries, whatever their order, and a uniform sample of it.
 
 use super::DeviceError;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, Traced};
 use ridgewatch_render::LogStretch;
 use ridgewatch_render::rng::philox;
@@ -41,8 +41,8 @@ pub struct QueryRouter<'a> {
     share: LabelShare,
     /// Labels, in the order of the queries (fewer than `keep`).
     pub samples: Samples,
-    /// Domain coordinates of the labels, whose hash the label rule takes.
-    label_points: Vec<[f32; 3]>,
+    /// Where the labels are, whose hash the label rule takes.
+    label_points: Vec<DomainPoint>,
     /// Counts and times of the frame so far.
     pub tally: Tally,
     /// First device error. All later queries are NaN.
@@ -52,8 +52,8 @@ pub struct QueryRouter<'a> {
 }
 
 /// Returns true if the label at a point is in the sample of 1 in 2^shift.
-pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
-    let [x, y, z] = point.map(f32::to_bits);
+pub fn keeps_label(point: DomainPoint, shift: u32) -> bool {
+    let [x, y, z] = point.0.map(f32::to_bits);
     shift == 0 || (shift < 32 && philox([x, y, z, 0], [0, 0])[0] >> (32 - shift) == 0)
 }
 
@@ -73,7 +73,7 @@ impl LabelShare {
         Self { bound: bound.max(2), shift, traced: 0 }
     }
 
-    pub(super) fn keeps(&self, point: [f32; 3]) -> bool {
+    pub(super) fn keeps(&self, point: DomainPoint) -> bool {
         keeps_label(point, self.shift)
     }
 
@@ -117,8 +117,8 @@ pub struct Tally {
 struct Scratch {
     to_trace: Vec<u32>,
     to_predict: Vec<u32>,
-    points: Vec<[f32; 3]>,
-    unit: Vec<[f32; 3]>,
+    points: Vec<DomainPoint>,
+    unit: Vec<UnitPoint>,
     values: Vec<f32>,
 }
 
@@ -189,18 +189,12 @@ impl<'a> QueryRouter<'a> {
     }
 }
 
-/// Converts an arrival point to unit coordinates, which may lie outside [0, 1].
-pub(super) fn unit_arrival(domain: &Domain, arrival: [f32; 3]) -> [f32; 3] {
-    let extent = domain.extent();
-    std::array::from_fn(|k| ((f64::from(arrival[k]) - domain.min[k]) / extent[k]) as f32)
-}
-
 /// Appends traced seed `i` to `samples` in unit coordinates. The Jacobian is scaled to unit coordinates on both sides.
-pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3], traced: &Traced, i: usize, extras: Extras) {
+pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: DomainPoint, traced: &Traced, i: usize, extras: Extras) {
     samples.points.push(domain.to_unit(point));
     samples.log_stretch.push(traced.log_stretch[i]);
     if extras.arrival {
-        samples.arrival.push(unit_arrival(domain, traced.arrival[i]));
+        samples.arrival.push(domain.to_unit_unclamped(traced.arrival[i]));
     }
     if extras.jacobian {
         let (j, extent) = (traced.jacobian[i], domain.extent());
@@ -209,7 +203,7 @@ pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3
 }
 
 impl QueryRouter<'_> {
-    fn route(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) -> Result<(), DeviceError> {
+    fn route(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) -> Result<(), DeviceError> {
         self.tally.queries += points.len() as u64;
         let domain = self.domain();
         let spent = self.budget_spent();
@@ -264,7 +258,7 @@ impl QueryRouter<'_> {
 }
 
 impl LogStretch for QueryRouter<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         if self.failure.is_none() {
             self.failure = self.route(points, log_stretch, traced).err();
         }
@@ -293,7 +287,7 @@ mod tests {
     }
 
     fn bits(samples: &Samples) -> Vec<[u32; 3]> {
-        samples.points.iter().map(|point| point.map(f32::to_bits)).collect()
+        samples.points.iter().map(|point| point.0.map(f32::to_bits)).collect()
     }
 
     fn sorted<T: Ord>(mut values: Vec<T>) -> Vec<T> {
@@ -303,7 +297,7 @@ mod tests {
 
     #[test]
     fn each_shift_halves_what_is_kept() {
-        let point = |i: u32| [i as f32 * 0.001, (i % 97) as f32, 0.5];
+        let point = |i: u32| DomainPoint([i as f32 * 0.001, (i % 97) as f32, 0.5]);
         let kept = |shift| (0..1 << 16).filter(|&i| keeps_label(point(i), shift)).count() as f64;
         for shift in 0..6 {
             let expected = f64::from(1 << 16) / f64::from(1 << shift);
@@ -318,9 +312,9 @@ mod tests {
     fn labels_are_an_even_share_below_the_bound_in_any_order() {
         const TRACED: usize = 20_000;
         let (tracer, gate) = (saddle(), Gate::uniform(false));
-        let mut points: Vec<[f32; 3]> = (0..TRACED as u32)
+        let mut points: Vec<DomainPoint> = (0..TRACED as u32)
             .map(|i| philox([i, 0, 0, 0], [7, 0]))
-            .map(|w| [0, 1, 2].map(|k| 2.0 * ridgewatch_render::rng::unit(w[k]) - 1.0))
+            .map(|w| DomainPoint([0, 1, 2].map(|k| 2.0 * ridgewatch_render::rng::unit(w[k]) - 1.0)))
             .collect();
         for keep in [0, 1, 2, 10, 1000, 4096, TRACED, 2 * TRACED] {
             let mut labels = |batch: usize| {
@@ -339,20 +333,20 @@ mod tests {
             let first = labels(TRACED);
             assert_eq!(sorted(bits(&first)), sorted(bits(&labels(777))), "{keep}");
             // Each arrival belongs to its point: x grows by e^0.7 about the middle, while the path is in the domain.
-            for (point, arrival) in first.points.iter().zip(&first.arrival).filter(|(point, _)| (point[0] - 0.5).abs() < 0.2) {
-                assert!((arrival[0] - 0.5 - 0.7_f32.exp() * (point[0] - 0.5)).abs() < 1e-3, "{point:?} arrives at {arrival:?}");
+            for (point, arrival) in first.points.iter().zip(&first.arrival).filter(|(point, _)| (point.0[0] - 0.5).abs() < 0.2) {
+                assert!((arrival.0[0] - 0.5 - 0.7_f32.exp() * (point.0[0] - 0.5)).abs() < 1e-3, "{point:?} arrives at {arrival:?}");
             }
             let share = (0..32).map(|shift| TRACED >> shift).find(|&share| share <= keep - keep / 4);
             if let Some(share) = share.filter(|_| keep >= 1000) {
                 let most = if share == TRACED { 0.0 } else { 4.0 * (share as f64).sqrt() };
                 assert!((first.len() as f64 - share as f64).abs() <= most, "{} of {share} for {keep}", first.len());
-                let left = first.points.iter().filter(|point| point[0] < 0.5).count() as f64;
+                let left = first.points.iter().filter(|point| point.0[0] < 0.5).count() as f64;
                 assert!((left - first.len() as f64 / 2.0).abs() <= 2.0 * (first.len() as f64).sqrt() + most, "{left} lie left");
             }
         }
         // Copies of a point have one hash: no share keeps some of them.
         let mut router = QueryRouter::new(&tracer, None, routing(&gate, 100));
-        router.evaluate(&[[0.25; 3]; 1000], &mut [0.0; 1000], &mut [false; 1000]);
+        router.evaluate(&[DomainPoint([0.25; 3]); 1000], &mut [0.0; 1000], &mut [false; 1000]);
         assert_eq!(router.samples.len(), 0);
     }
 

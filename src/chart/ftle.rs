@@ -6,6 +6,7 @@ use super::{Charting, device_name, failed};
 use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
+use crate::field::{DomainPoint, UnitPoint};
 use crate::flow::{
     Composition, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer, dormand_prince_tracer,
 };
@@ -145,9 +146,9 @@ impl Opened {
     }
 
     /// Uniform random points in unit and in domain coordinates; in two dimensions all lie in the middle of the slab.
-    pub(super) fn random_points(&self, count: usize) -> [Vec<[f32; 3]>; 2] {
+    pub(super) fn random_points(&self, count: usize) -> (Vec<UnitPoint>, Vec<DomainPoint>) {
         let Points { unit, domain } = Points::random(self, count, 5);
-        [unit, domain]
+        (unit, domain)
     }
 
     /// A tracer of the CPU.
@@ -158,25 +159,25 @@ impl Opened {
 
 /// Points in unit and in domain coordinates.
 pub(super) struct Points {
-    pub(super) unit: Vec<[f32; 3]>,
-    domain: Vec<[f32; 3]>,
+    pub(super) unit: Vec<UnitPoint>,
+    domain: Vec<DomainPoint>,
 }
 
 impl Points {
     /// Uniform random points; in two dimensions all lie in the middle of the slab.
     pub(super) fn random(opened: &Opened, count: usize, stream: u32) -> Self {
         let (seed, domain) = (opened.plan.scene.seed, &opened.plan.domain);
-        let unit: Vec<[f32; 3]> = (0..count as u32)
+        let unit: Vec<UnitPoint> = (0..count as u32)
             .map(|i| {
                 let words = philox([i, stream, 0, 0], [seed as u32, (seed >> 32) as u32]);
-                std::array::from_fn(|axis| if axis < domain.dimensions { unit(words[axis]) } else { 0.5 })
+                UnitPoint(std::array::from_fn(|axis| if axis < domain.dimensions { unit(words[axis]) } else { 0.5 }))
             })
             .collect();
         let domain = unit.iter().map(|&point| domain.from_unit(point)).collect();
         Self { unit, domain }
     }
 
-    fn first(&self, count: usize) -> (&[[f32; 3]], &[[f32; 3]]) {
+    fn first(&self, count: usize) -> (&[UnitPoint], &[DomainPoint]) {
         let count = count.min(self.unit.len());
         (&self.unit[..count], &self.domain[..count])
     }
@@ -208,7 +209,7 @@ impl Bench<'_, '_> {
         setting: String,
         built: Built,
         answer: impl FnOnce(&Points) -> Result<Vec<f64>, RunError> + Send,
-        seconds: impl FnMut(&[[f32; 3]], &[[f32; 3]]) -> Result<f64, RunError> + Send,
+        seconds: impl FnMut(&[UnitPoint], &[DomainPoint]) -> Result<f64, RunError> + Send,
     ) -> Result<(), RunError> {
         let tau = self.opened.plan.map.tau;
         let Self { charting, points, truth, timed, .. } = self;
@@ -270,7 +271,7 @@ impl Bench<'_, '_> {
 }
 
 /// Samples per second: the median of three batches, after batches that grow until one takes long enough to be timed.
-fn speed(timed: &Points, mut seconds: impl FnMut(&[[f32; 3]], &[[f32; 3]]) -> Result<f64, RunError>) -> Result<f64, RunError> {
+fn speed(timed: &Points, mut seconds: impl FnMut(&[UnitPoint], &[DomainPoint]) -> Result<f64, RunError>) -> Result<f64, RunError> {
     let mut batch = MIN_BATCH;
     let mut time = |batch: usize| {
         let (unit, domain) = timed.first(batch);
@@ -356,7 +357,7 @@ fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64
     let affordable = seconds * MIN_POINTS as f64 / began.elapsed().as_secs_f64();
     let points = Points::random(opened, (affordable as usize).clamp(MIN_POINTS, MAX_POINTS), 0);
     tracer.trace(&points.domain, Extras::default(), &mut traced);
-    let ftle = |(s, seed): (&f64, &[f32; 3])| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
+    let ftle = |(s, seed): (&f64, &DomainPoint)| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
     let truth = traced.log_stretch_f64.iter().zip(&points.domain).map(ftle).collect();
     (points, truth)
 }
@@ -462,12 +463,12 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
         for (name, composition, seconds) in [("composition", &plain, plain_seconds), ("composition, hierarchical", &joined, joined_seconds)]
         {
             let built = Built { seconds, bytes: composition.bytes() as u64 };
-            let of = |unit: &[[f32; 3]]| {
+            let of = |unit: &[UnitPoint]| {
                 let mut values = vec![0.0; unit.len()];
                 composition.log_stretch(unit, &mut values);
                 values
             };
-            let seconds = |unit: &[[f32; 3]], _: &[[f32; 3]]| {
+            let seconds = |unit: &[UnitPoint], _: &[DomainPoint]| {
                 let began = Instant::now();
                 of(unit);
                 Ok(began.elapsed().as_secs_f64())

@@ -140,7 +140,7 @@ fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, is_gpu: bool,
     let chosen = FlowMap { steps: opened.auto_steps(), ..map.clone() };
     let tracer = backend.tracer(&opened.slide.velocity, &chosen, opened.slide.time)?;
     let batch = BATCH[usize::from(is_gpu)];
-    let [unit, seeds] = opened.random_points(batch);
+    let (unit, seeds) = opened.random_points(batch);
     let mut traced = Traced::default();
     let trace = median(batch, || tracer.seconds(&seeds, &mut traced))?;
     let nodes = opened.own_nodes(is_gpu);

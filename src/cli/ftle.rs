@@ -4,8 +4,8 @@ use super::common::{Common, Usage, check_folder, chosen_steps, device, dimension
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, TracedOnce};
-use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
@@ -199,9 +199,9 @@ fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
     tracer.step_choice().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
 }
 
-fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
+fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<DomainPoint> {
     let at = |i: usize, n: usize| if n > 1 { i as f32 / (n - 1) as f32 } else { 0.5 };
-    (0..nx * ny * nz).map(|i| domain.from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
+    (0..nx * ny * nz).map(|i| domain.from_unit(UnitPoint([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)]))).collect()
 }
 
 /// FTLE of a flow whose FTLE is uniform and known. `None` for other flows.
@@ -231,7 +231,7 @@ fn unrounded(traced: &Traced) -> Vec<f64> {
 }
 
 /// FTLE at the seeds that counts as the truth, with its name.
-fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str, Vec<f64>)> {
+fn truth(plan: &Plan, slide: &Slide, seeds: &[DomainPoint]) -> Result<(&'static str, Vec<f64>)> {
     if let Some(value) = closed_form(plan, &slide.velocity) {
         return Ok(("closed form", vec![value; seeds.len()]));
     }
@@ -239,14 +239,14 @@ fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str
     Ok(("Dormand-Prince, f64", ftle(&map, slide, seeds)?))
 }
 
-fn ftle(map: &FlowMap, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Vec<f64>> {
+fn ftle(map: &FlowMap, slide: &Slide, seeds: &[DomainPoint]) -> Result<Vec<f64>> {
     let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
     let mut traced = Traced::default();
     tracer.trace(seeds, Extras::default(), &mut traced);
     Ok(unrounded(&traced).iter().map(|s| s / map.tau).collect())
 }
 
-fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]], ftle: &[f64]) -> Result<Check> {
+fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[DomainPoint], ftle: &[f64]) -> Result<Check> {
     let (name, truth) = truth(plan, slide, seeds)?;
     let pairs = comparable(tracer, seeds, ftle, &truth)?;
     let (rms, maximum) = difference(&pairs);
@@ -263,7 +263,7 @@ fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]], ft
 }
 
 /// Both values at every seed with a velocity. A value there that is not finite is an error.
-fn comparable(tracer: &dyn Tracer, seeds: &[[f32; 3]], a: &[f64], b: &[f64]) -> Result<Vec<(f64, f64)>> {
+fn comparable(tracer: &dyn Tracer, seeds: &[DomainPoint], a: &[f64], b: &[f64]) -> Result<Vec<(f64, f64)>> {
     let pairs = a.iter().copied().zip(b.iter().copied());
     let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_missing(**seed)).map(|(pair, _)| pair).collect();
     let failed = pairs.iter().filter(|(a, b)| !a.is_finite() || !b.is_finite()).count();
@@ -280,7 +280,7 @@ fn difference(pairs: &[(f64, f64)]) -> (f64, f64) {
     (square.sqrt(), pairs.iter().map(|(a, b)| (a - b).abs()).fold(0.0, f64::max))
 }
 
-fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]]) -> Result<Convergence> {
+fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[DomainPoint]) -> Result<Convergence> {
     let (name, truth) = truth(plan, slide, seeds)?;
     let steps: Vec<usize> = (0..6).map(|k| 5 << k).collect();
     let mut rms = Vec::new();

@@ -1,5 +1,16 @@
 //! The box that seeds and pictures cover.
 
+/// A point in domain coordinates: those of the data (degrees on the sphere). What is traced, and where particles arrive.
+#[repr(transparent)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct DomainPoint(pub [f32; 3]);
+
+/// A point in unit coordinates: shares of the domain's edges, without a unit, in [0, 1] inside of the domain. What surrogates, nodes and the trust
+/// map take. [`Domain`] converts.
+#[repr(transparent)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct UnitPoint(pub [f32; 3]);
+
 /// An axis-aligned box in the coordinates of the data (degrees on the sphere). Two-dimensional flows are extruded: no velocity depends on the
 /// third axis, whose extent is the thickness of a slab.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,19 +49,24 @@ impl Domain {
     }
 
     /// Converts unit coordinates in [0, 1] to domain coordinates.
-    pub fn from_unit(&self, unit: [f32; 3]) -> [f32; 3] {
+    pub fn from_unit(&self, unit: UnitPoint) -> DomainPoint {
         let extent = self.extent();
-        std::array::from_fn(|k| (self.min[k] + extent[k] * f64::from(unit[k])) as f32)
+        DomainPoint(std::array::from_fn(|k| (self.min[k] + extent[k] * f64::from(unit.0[k])) as f32))
     }
 
     /// Converts domain coordinates to unit coordinates, clamped to [0, 1].
-    pub fn to_unit(&self, point: [f32; 3]) -> [f32; 3] {
+    pub fn to_unit(&self, point: DomainPoint) -> UnitPoint {
+        UnitPoint(self.to_unit_unclamped(point).0.map(|x| x.clamp(0.0, 1.0)))
+    }
+
+    /// Converts domain coordinates to unit coordinates, beyond [0, 1] too: arrivals may lie outside of the domain.
+    pub fn to_unit_unclamped(&self, point: DomainPoint) -> UnitPoint {
         let extent = self.extent();
-        std::array::from_fn(|k| (((f64::from(point[k]) - self.min[k]) / extent[k]) as f32).clamp(0.0, 1.0))
+        UnitPoint(std::array::from_fn(|k| ((f64::from(point.0[k]) - self.min[k]) / extent[k]) as f32))
     }
 
     /// True if the point lies in the closed box.
-    pub fn contains(&self, point: [f32; 3]) -> bool {
-        (0..3).all(|k| f64::from(point[k]) >= self.min[k] && f64::from(point[k]) <= self.max[k])
+    pub fn contains(&self, point: DomainPoint) -> bool {
+        (0..3).all(|k| f64::from(point.0[k]) >= self.min[k] && f64::from(point.0[k]) <= self.max[k])
     }
 }

@@ -12,7 +12,7 @@ pub mod analytic;
 pub mod turbulence;
 
 pub use axis::{Axis, AxisFault};
-pub use domain::Domain;
+pub use domain::{Domain, DomainPoint, UnitPoint};
 pub use grid::{Geometry, Grid, VERTICAL_EDGE, is_pole};
 pub use snapshot::Snapshot;
 pub use window::{Pushed, Window, WindowFault, WindowWarning};

@@ -5,7 +5,7 @@
 use super::stretch::log_stretch;
 use super::{Boundary, Extras, FlowError, FlowMap, Normalisation, Traced, VelocitySource, cpu_tracer};
 use rayon::prelude::*;
-use ridgewatch_field::{Domain, Geometry};
+use ridgewatch_field::{Domain, DomainPoint, Geometry, UnitPoint};
 
 /// Nodes traced at once, which bounds the memory beside the tables.
 const AT_ONCE: usize = 1 << 20;
@@ -61,14 +61,14 @@ impl Composition {
             let mut table = vec![[0.0; 3]; built.nodes.iter().product()];
             let mut traced = Traced::default();
             for (number, displacements) in table.chunks_mut(AT_ONCE).enumerate() {
-                let unit: Vec<[f32; 3]> = (0..displacements.len()).into_par_iter().map(|i| built.unit(number * AT_ONCE + i)).collect();
-                let seeds: Vec<[f32; 3]> = unit.par_iter().map(|&point| built.domain.from_unit(point)).collect();
+                let unit: Vec<UnitPoint> = (0..displacements.len()).into_par_iter().map(|i| built.unit(number * AT_ONCE + i)).collect();
+                let seeds: Vec<DomainPoint> = unit.par_iter().map(|&point| built.domain.from_unit(point)).collect();
                 tracer.trace(&seeds, Extras { arrival: true, jacobian: false }, &mut traced);
-                let (min, extent) = (built.domain.min, built.domain.extent());
                 for ((displacement, arrival), seed) in displacements.iter_mut().zip(&traced.arrival).zip(&unit) {
+                    let arrival = built.domain.to_unit_unclamped(*arrival);
                     // Missing cells have no arrival; a particle rests there.
                     *displacement = std::array::from_fn(|axis| {
-                        let moved = ((f64::from(arrival[axis]) - min[axis]) / extent[axis]) as f32 - seed[axis];
+                        let moved = arrival.0[axis] - seed.0[axis];
                         if moved.is_finite() && axis < built.domain.dimensions { moved } else { 0.0 }
                     });
                 }
@@ -94,7 +94,7 @@ impl Composition {
         let mut first = pair[0].clone();
         if let Some(second) = pair.get(1) {
             first.0.par_iter_mut().enumerate().for_each(|(node, displacement)| {
-                let from = self.unit(node).map(f64::from);
+                let from = self.unit(node).0.map(f64::from);
                 let there: [f64; 3] = std::array::from_fn(|axis| from[axis] + f64::from(displacement[axis]));
                 let (further, _) = self.interpolate(second, there);
                 *displacement = std::array::from_fn(|axis| (f64::from(displacement[axis]) + further[axis]) as f32);
@@ -109,10 +109,10 @@ impl Composition {
     }
 
     /// Unit coordinates of a node. Two-dimensional flows are traced in the middle of the slab.
-    fn unit(&self, node: usize) -> [f32; 3] {
+    fn unit(&self, node: usize) -> UnitPoint {
         let [x, y, _] = self.nodes;
         let index = [node % x, node / x % y, node / (x * y)];
-        std::array::from_fn(|axis| if self.nodes[axis] > 1 { index[axis] as f32 / (self.nodes[axis] - 1) as f32 } else { 0.5 })
+        UnitPoint(std::array::from_fn(|axis| if self.nodes[axis] > 1 { index[axis] as f32 / (self.nodes[axis] - 1) as f32 } else { 0.5 }))
     }
 
     /// Interpolated displacement at a unit point and its derivatives, `[component][axis]`. Outside the domain both are those at its edge.
@@ -148,7 +148,7 @@ impl Composition {
     }
 
     /// Writes the log-stretch at unit points into `out` (same length).
-    pub fn log_stretch(&self, points: &[[f32; 3]], out: &mut [f64]) {
+    pub fn log_stretch(&self, points: &[UnitPoint], out: &mut [f64]) {
         points.par_chunks(CHUNK).zip(out.par_chunks_mut(CHUNK)).for_each(|(points, out)| {
             for (point, out) in points.iter().zip(out) {
                 *out = if self.domain.dimensions == 2 { self.stretch_at::<2>(*point) } else { self.stretch_at::<3>(*point) };
@@ -156,8 +156,8 @@ impl Composition {
         });
     }
 
-    fn stretch_at<const D: usize>(&self, point: [f32; 3]) -> f64 {
-        let mut at = point.map(f64::from);
+    fn stretch_at<const D: usize>(&self, point: UnitPoint) -> f64 {
+        let mut at = point.0.map(f64::from);
         let mut jacobian: [[f64; D]; D] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
         for table in &self.tables {
             let (displacement, derivative) = self.interpolate(table, at);
@@ -187,8 +187,9 @@ mod tests {
         let velocity = VelocitySource::Analytic(flow, domain.clone());
         let map = FlowMap { boundary: Boundary::Unbounded, ..FlowMap::tangent(5.0, 200) };
         let composed = Composition::trace(&velocity, &map, 0.0, [2 * nodes, nodes, 1], intervals, 40).unwrap().unwrap();
-        let points = super::super::steps::quasi_random_points(&Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)), 500);
-        let seeds: Vec<[f32; 3]> = points.iter().map(|&p| domain.from_unit(p)).collect();
+        let cube = Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0));
+        let points: Vec<UnitPoint> = super::super::steps::quasi_random_points(&cube, 500).into_iter().map(|p| cube.to_unit(p)).collect();
+        let seeds: Vec<DomainPoint> = points.iter().map(|&p| domain.from_unit(p)).collect();
         let mut truth = Traced::default();
         cpu_tracer(velocity, &map, 0.0).unwrap().trace(&seeds, Extras::default(), &mut truth);
         [composed.clone(), composed.joined()].map(|composed| {

@@ -4,6 +4,7 @@
 use super::rk4::TracedBatch;
 use super::stretch::{log_stretch, max_abs, rescale};
 use super::velocity::Velocity;
+use ridgewatch_field::DomainPoint;
 
 /// Nodes of the pair.
 const C: [f64; 7] = [0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0, 1.0];
@@ -54,9 +55,9 @@ pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
     from: f64,
     to: f64,
     tolerance: f64,
-    points: &[[f32; 3]],
+    points: &[DomainPoint],
 ) -> TracedBatch<f64, D, N> {
-    let seed = points[0].map(f64::from);
+    let seed = points[0].0.map(f64::from);
     let span = to - from;
     let mut state: State<D, N> = (field.seed_state(seed), field.initial_tangent(seed));
     let mut exponent = 0.0;

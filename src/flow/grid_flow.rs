@@ -3,7 +3,7 @@
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Coordinates, Velocity, bounds, identity, within};
 use super::{Boundary, FlowError, Interpolation};
-use ridgewatch_field::{Grid, Window};
+use ridgewatch_field::{DomainPoint, Grid, Window};
 use ridgewatch_simd::{Gather, Real, array};
 
 /// A window on a Cartesian grid of D axes.
@@ -33,8 +33,8 @@ impl<R: Real, const D: usize> GridFlow<R, D> {
 }
 
 impl<R: Real, const D: usize> Coordinates<D, D> for GridFlow<R, D> {
-    fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
-        Some(self.sampler.sort_key(&self.seed_state(point.map(f64::from))))
+    fn sort_key(&self, point: DomainPoint) -> Option<u32> {
+        Some(self.sampler.sort_key(&self.seed_state(point.0.map(f64::from))))
     }
     fn seed_state(&self, point: [f64; 3]) -> [f64; D] {
         array(|k| self.sampler.axes[k].state(point[k]))
@@ -45,8 +45,8 @@ impl<R: Real, const D: usize> Coordinates<D, D> for GridFlow<R, D> {
     fn separation(&self, _: [f64; 3], axis: usize, step: f64) -> f64 {
         2.0 * step / self.spacing[axis]
     }
-    fn arrival_point(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
-        array(|k| state.get(k).map_or(seed[k], |&x| self.sampler.axes[k].coordinate(x) as f32))
+    fn arrival_point(&self, state: &[f64; D], seed: DomainPoint) -> DomainPoint {
+        DomainPoint(array(|k| state.get(k).map_or(seed.0[k], |&x| self.sampler.axes[k].coordinate(x) as f32)))
     }
     fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], gradient: [[f64; D]; D]) -> [[f64; D]; D] {
         gradient

@@ -2,7 +2,7 @@
 
 use super::Interpolation;
 use rayon::prelude::*;
-use ridgewatch_field::{Axis, Grid, Snapshot, Window};
+use ridgewatch_field::{Axis, DomainPoint, Grid, Snapshot, Window};
 use std::sync::Arc;
 
 /// The missing cells of a window at one time.
@@ -36,9 +36,9 @@ impl MissingCells {
     }
 
     /// True if a node that the interpolation reads at the seed has no velocity.
-    pub fn is_missing(&self, seed: [f32; 3]) -> bool {
+    pub fn is_missing(&self, seed: DomainPoint) -> bool {
         let Some(grid) = self.grid() else { return false };
-        self.is_cell_missing(std::array::from_fn(|k| grid.axes.get(k).map_or(0, |axis| cell_at(axis, f64::from(seed[k])))))
+        self.is_cell_missing(std::array::from_fn(|k| grid.axes.get(k).map_or(0, |axis| cell_at(axis, f64::from(seed.0[k])))))
     }
 
     /// The grid and, for each of its cells (x fastest), whether the cell is missing; `None` if no cell is. A periodic axis has a cell
@@ -113,19 +113,31 @@ mod tests {
             window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &[0.0; 16], &[]))).unwrap();
         }
         let missing_cells = MissingCells::at(&window, 1.0, Interpolation::Linear);
-        assert!(missing_cells.is_missing([10.0, 0.5, 0.0]) && missing_cells.is_missing([350.0, 1.5, 0.0]), "on both sides of the seam");
+        assert!(
+            missing_cells.is_missing(DomainPoint([10.0, 0.5, 0.0])) && missing_cells.is_missing(DomainPoint([350.0, 1.5, 0.0])),
+            "on both sides of the seam"
+        );
         let wider = MissingCells::at(&window, 1.0, Interpolation::Cubic);
-        assert!(wider.is_missing([100.0, 0.5, 0.0]) && wider.is_missing([10.0, 2.5, 0.0]), "cubic reads one node further");
-        assert!(!missing_cells.is_missing([100.0, 0.5, 0.0]) && !missing_cells.is_missing([10.0, 2.5, 0.0]));
+        assert!(
+            wider.is_missing(DomainPoint([100.0, 0.5, 0.0])) && wider.is_missing(DomainPoint([10.0, 2.5, 0.0])),
+            "cubic reads one node further"
+        );
+        assert!(!missing_cells.is_missing(DomainPoint([100.0, 0.5, 0.0])) && !missing_cells.is_missing(DomainPoint([10.0, 2.5, 0.0])));
         for missing_cells in [&missing_cells, &wider] {
             let (_, cells) = missing_cells.cells().unwrap();
-            let held = |i: usize| missing_cells.is_missing([90.0 * (i % 4) as f32 + 45.0, (i / 4) as f32 + 0.5, 0.0]);
+            let held = |i: usize| missing_cells.is_missing(DomainPoint([90.0 * (i % 4) as f32 + 45.0, (i / 4) as f32 + 0.5, 0.0]));
             assert_eq!(cells, (0..12).map(held).collect::<Vec<_>>(), "four cells around, three along the latitude");
         }
         assert!(MissingCells::none().cells().is_none());
         u[4] = 0.0;
         window.push(Arc::new(Snapshot::from_components(2.0, grid, &u, &[0.0; 16], &[]))).unwrap();
-        assert!(!MissingCells::at(&window, 2.0, Interpolation::Linear).is_missing([10.0, 0.5, 0.0]), "the newest snapshot has it");
-        assert!(MissingCells::at(&window, 1.5, Interpolation::Linear).is_missing([10.0, 0.5, 0.0]), "between snapshots both count");
+        assert!(
+            !MissingCells::at(&window, 2.0, Interpolation::Linear).is_missing(DomainPoint([10.0, 0.5, 0.0])),
+            "the newest snapshot has it"
+        );
+        assert!(
+            MissingCells::at(&window, 1.5, Interpolation::Linear).is_missing(DomainPoint([10.0, 0.5, 0.0])),
+            "between snapshots both count"
+        );
     }
 }

@@ -6,7 +6,7 @@
 //! FTLE(x, t, tau) = 1/|tau| ln sqrt(lambda_max(J^T J)) with J = d phi / d x, the gradient of the flow map phi (Haller 2001; Shadden, Lekien
 //! and Marsden 2005). J is the solution of the variational equation dJ/dt = (grad v) J, integrated together with the path (`rk4`).
 
-use ridgewatch_field::{Domain, Window, analytic::Analytic};
+use ridgewatch_field::{Domain, DomainPoint, Window, analytic::Analytic};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -218,7 +218,7 @@ pub struct Traced {
     /// Share of |tau| until the particle stopped, in [0, 1]; 1 if it never stopped.
     pub lifetime_share: Vec<f32>,
     /// Arrival positions; empty unless requested.
-    pub arrival: Vec<[f32; 3]>,
+    pub arrival: Vec<DomainPoint>,
     /// Jacobians; empty unless requested.
     pub jacobian: Vec<[f32; 9]>,
 }
@@ -230,7 +230,7 @@ impl Traced {
         self.log_stretch.resize(count, f32::NAN);
         self.log_stretch_f64.resize(wanted(double), f64::NAN);
         self.lifetime_share.resize(count, 0.0);
-        self.arrival.resize(wanted(extras.arrival), [f32::NAN; 3]);
+        self.arrival.resize(wanted(extras.arrival), DomainPoint([f32::NAN; 3]));
         self.jacobian.resize(wanted(extras.jacobian), [f32::NAN; 9]);
     }
 }
@@ -274,11 +274,11 @@ pub trait Tracer: Send + Sync {
         false
     }
     /// True if a seed lies in a missing cell at the start time: it has no FTLE.
-    fn is_missing(&self, _seed: [f32; 3]) -> bool {
+    fn is_missing(&self, _seed: DomainPoint) -> bool {
         false
     }
     /// Traces all seeds in parallel on the current rayon pool, sorted by cell if that is faster. Replaces the contents of `out`.
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced);
 }
 
 impl Tracer for Box<dyn Tracer> {
@@ -306,11 +306,11 @@ impl Tracer for Box<dyn Tracer> {
         (**self).has_missing()
     }
 
-    fn is_missing(&self, seed: [f32; 3]) -> bool {
+    fn is_missing(&self, seed: DomainPoint) -> bool {
         (**self).is_missing(seed)
     }
 
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) {
         (**self).trace(seeds, extras, out);
     }
 }

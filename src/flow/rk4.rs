@@ -6,6 +6,7 @@
 
 use super::stretch::{log_stretch, rescale};
 use super::velocity::Velocity;
+use ridgewatch_field::DomainPoint;
 use ridgewatch_simd::{Lanes, Mask, Real, array};
 
 /// Result of a batch of particles, one per lane.
@@ -87,15 +88,15 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
     field: &V,
     stages: &[V::Stage],
     step: f64,
-    points: &[[f32; 3]],
+    points: &[DomainPoint],
 ) -> TracedBatch<L, D, C> {
     let steps = stages.len() / 2;
     let (h, half, sixth, two) = (L::splat_f64(step), L::splat_f64(step / 2.0), L::splat_f64(step / 6.0), L::splat_f64(2.0));
-    let mut x: [L; D] = lanes_of(points, |p| field.seed_state(p.map(f64::from)));
+    let mut x: [L; D] = lanes_of(points, |p| field.seed_state(p.0.map(f64::from)));
     let mut m: [[L; C]; D] = {
         let columns: [[L; D]; C] = array(|c| {
             lanes_of(points, |p| {
-                let tangent = field.initial_tangent(p.map(f64::from));
+                let tangent = field.initial_tangent(p.0.map(f64::from));
                 array(|i| tangent[i][c])
             })
         });
@@ -164,14 +165,14 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
     stages: &[V::Stage],
     step: f64,
     difference_step: f64,
-    points: &[[f32; 3]],
+    points: &[DomainPoint],
 ) -> TracedBatch<L, D, C> {
     let steps = stages.len() / 2;
     let factors = [L::splat_f64(step), L::splat_f64(step / 2.0), L::splat_f64(step / 6.0), L::splat_f64(2.0)];
     let mut pairs: [[[L; D]; 2]; C] = array(|axis| {
         [difference_step, -difference_step].map(|offset| {
             lanes_of(points, |p| {
-                let mut p = p.map(f64::from);
+                let mut p = p.0.map(f64::from);
                 p[axis] += offset;
                 field.seed_state(p)
             })
@@ -199,7 +200,7 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
             }
         }
     }
-    let [inverse]: [[L; C]; 1] = [lanes_of(points, |p| array(|axis| 1.0 / field.separation(p.map(f64::from), axis, difference_step)))];
+    let [inverse]: [[L; C]; 1] = [lanes_of(points, |p| array(|axis| 1.0 / field.separation(p.0.map(f64::from), axis, difference_step)))];
     let m: [[L; C]; D] = array(|i| array(|c| (pairs[c][0][i] - pairs[c][1][i]) * inverse[c]));
     let half = L::splat_f64(0.5 / C as f64);
     let mut state = array(|i| pairs.iter().flatten().fold(L::zero(), |sum, x| half.mul_add(x[i], sum)));

@@ -8,7 +8,7 @@ use super::axis_map::AxisMap;
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Coordinates, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
-use ridgewatch_field::{Grid, Window, is_pole};
+use ridgewatch_field::{DomainPoint, Grid, Window, is_pole};
 use ridgewatch_simd::{Gather, Lanes, Real, array};
 
 /// Converts directions to locations on a longitude-latitude grid in degrees.
@@ -191,8 +191,8 @@ pub(super) fn trigonometry(point: [f64; 3]) -> [f64; 4] {
 }
 
 impl<R: Real> Coordinates<3, 2> for SphereFlow<R> {
-    fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
-        Some(self.sampler.sort_key(&array(|k| self.sampler.axes[k].state(f64::from(point[k])))))
+    fn sort_key(&self, point: DomainPoint) -> Option<u32> {
+        Some(self.sampler.sort_key(&array(|k| self.sampler.axes[k].state(f64::from(point.0[k])))))
     }
     fn seed_state(&self, point: [f64; 3]) -> [f64; 3] {
         let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
@@ -206,9 +206,9 @@ impl<R: Real> Coordinates<3, 2> for SphereFlow<R> {
         let arc = 2.0 * step.to_radians();
         if axis == 0 { arc * point[1].to_radians().cos() } else { arc }
     }
-    fn arrival_point(&self, state: &[f64; 3], seed: [f32; 3]) -> [f32; 3] {
+    fn arrival_point(&self, state: &[f64; 3], seed: DomainPoint) -> DomainPoint {
         let [longitude, latitude] = self.globe.arrival(state);
-        [longitude as f32, latitude as f32, seed[2]]
+        DomainPoint([longitude as f32, latitude as f32, seed.0[2]])
     }
     fn coordinate_jacobian(&self, seed: [f64; 3], state: &[f64; 3], gradient: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
         let (before, after) = (seed[1].to_radians().cos(), state[0].hypot(state[1]).max(MIN_COSINE));

@@ -9,7 +9,7 @@ use super::sampler::{GridStage, Sampler};
 use super::sphere::{Globe, MIN_COSINE, dot, normalised, project, project_derivative, trigonometry};
 use super::velocity::{Coordinates, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
-use ridgewatch_field::{Grid, Window};
+use ridgewatch_field::{DomainPoint, Grid, Window};
 use ridgewatch_simd::{Gather, Real, array};
 
 /// A window on a grid of longitude, latitude (degrees) and height (the unit of the radius).
@@ -47,8 +47,8 @@ impl<R: Real> LayeredSphereFlow<R> {
 }
 
 impl<R: Real> Coordinates<4, 3> for LayeredSphereFlow<R> {
-    fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
-        Some(self.sampler.sort_key(&array(|k| self.sampler.axes[k].state(f64::from(point[k])))))
+    fn sort_key(&self, point: DomainPoint) -> Option<u32> {
+        Some(self.sampler.sort_key(&array(|k| self.sampler.axes[k].state(f64::from(point.0[k])))))
     }
     fn seed_state(&self, point: [f64; 3]) -> [f64; 4] {
         let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
@@ -61,9 +61,9 @@ impl<R: Real> Coordinates<4, 3> for LayeredSphereFlow<R> {
     fn separation(&self, point: [f64; 3], axis: usize, step: f64) -> f64 {
         2.0 * step * self.scales(point[1].to_radians().cos())[axis]
     }
-    fn arrival_point(&self, state: &[f64; 4], _: [f32; 3]) -> [f32; 3] {
+    fn arrival_point(&self, state: &[f64; 4], _: DomainPoint) -> DomainPoint {
         let [longitude, latitude] = self.globe.arrival(&state[..3]);
-        [longitude as f32, latitude as f32, self.sampler.axes[2].coordinate(state[3]) as f32]
+        DomainPoint([longitude as f32, latitude as f32, self.sampler.axes[2].coordinate(state[3]) as f32])
     }
     fn coordinate_jacobian(&self, seed: [f64; 3], state: &[f64; 4], gradient: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
         let (before, after) = (self.scales(seed[1].to_radians().cos()), self.scales(state[0].hypot(state[1])));

@@ -1,7 +1,7 @@
 //! Chooses the number of Runge-Kutta steps by its error: step doubling on quasi-random points (Roberts 2018).
 
 use super::{FlowError, StepChoice, Traced};
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 
 /// Smallest number of steps tried on closed forms.
 const MIN_STEPS: usize = 4;
@@ -24,11 +24,11 @@ const TRIMMED_SHARE: f64 = 0.02;
 const MIN_COMPLETE_PATHS: usize = 64;
 
 /// Quasi-random points of a domain: the additive recurrence of the generalised golden ratio (Roberts 2018).
-pub fn quasi_random_points(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+pub fn quasi_random_points(domain: &Domain, count: usize) -> Vec<DomainPoint> {
     // The real root of x^4 = x + 1.
     const RATIO: f64 = 1.220_744_084_605_759_5;
     (0..count)
-        .map(|n| domain.from_unit(std::array::from_fn(|k| (0.5 + (n + 1) as f64 * RATIO.powi(-(k as i32) - 1)).fract() as f32)))
+        .map(|n| domain.from_unit(UnitPoint(std::array::from_fn(|k| (0.5 + (n + 1) as f64 * RATIO.powi(-(k as i32) - 1)).fract() as f32))))
         .collect()
 }
 
@@ -90,7 +90,7 @@ pub fn choose_steps(
     tolerance: f64,
     GridConstraints { intervals, min_steps, share }: GridConstraints,
     domain: &Domain,
-    mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
+    mut trace: impl FnMut(usize, &[DomainPoint], &mut Traced),
 ) -> Result<StepChoice, FlowError> {
     let points = quasi_random_points(domain, StepChoice::POINTS);
     let (mut once, mut twice) = (Traced::default(), Traced::default());
@@ -137,7 +137,7 @@ mod tests {
         let points = quasi_random_points(&domain, 512);
         assert!(points.iter().all(|p| domain.contains(*p)));
         for octant in 0..8 {
-            let inside = |p: &&[f32; 3]| (0..3).all(|k| (domain.to_unit(**p)[k] >= 0.5) == (octant >> k & 1 == 1));
+            let inside = |p: &&DomainPoint| (0..3).all(|k| (domain.to_unit(**p).0[k] >= 0.5) == (octant >> k & 1 == 1));
             let count = points.iter().filter(inside).count();
             // An even share is 64. Independent points would deviate by 7.5 on average and by about 15 in some octant.
             assert!((54..=74).contains(&count), "{count}");

@@ -6,7 +6,7 @@ use super::velocity::{Coordinates, Velocity};
 use super::{Boundary, Extras, Normalisation, StepChoice, Traced, Tracer, dormand_prince};
 use rayon::prelude::*;
 use ridgewatch_base::progress;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint};
 use ridgewatch_simd::{Lanes, Mask, Real};
 use std::marker::PhantomData;
 
@@ -15,7 +15,7 @@ pub trait Kernel<V, L: Lanes, const D: usize, const C: usize>: Send + Sync {
     /// Steps per path; 0 if the step size is adaptive.
     fn steps(&self) -> usize;
     /// Traces at most `L::LANES` points.
-    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C>;
+    fn trace_batch(&self, field: &V, points: &[DomainPoint]) -> TracedBatch<L, D, C>;
 }
 
 /// The velocity stages at all times of fixed steps, evaluated once.
@@ -50,7 +50,7 @@ impl<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize> Kernel<V, L
     fn steps(&self) -> usize {
         self.0.stages.len() / 2
     }
-    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C> {
+    fn trace_batch(&self, field: &V, points: &[DomainPoint]) -> TracedBatch<L, D, C> {
         rk4::tangent(field, &self.0.stages, self.0.step, points)
     }
 }
@@ -62,7 +62,7 @@ impl<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize> Kernel<V, L
     fn steps(&self) -> usize {
         self.0.stages.len() / 2
     }
-    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C> {
+    fn trace_batch(&self, field: &V, points: &[DomainPoint]) -> TracedBatch<L, D, C> {
         rk4::differences(field, &self.0.stages, self.0.step, self.1, points)
     }
 }
@@ -81,7 +81,7 @@ impl<V: Velocity<f64, D, C>, const D: usize, const C: usize> Kernel<V, f64, D, C
     fn steps(&self) -> usize {
         0
     }
-    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<f64, D, C> {
+    fn trace_batch(&self, field: &V, points: &[DomainPoint]) -> TracedBatch<f64, D, C> {
         dormand_prince::trace(field, self.from, self.to, self.tolerance, points)
     }
 }
@@ -154,7 +154,7 @@ where
     L: Lanes,
 {
     /// Indices of the seeds in the order in which they are traced; `None` if that is the given order.
-    fn sorted(&self, seeds: &[[f32; 3]]) -> Option<Vec<u32>> {
+    fn sorted(&self, seeds: &[DomainPoint]) -> Option<Vec<u32>> {
         if self.order == Order::Given || seeds.len() < SORT_FROM {
             return None;
         }
@@ -177,11 +177,11 @@ where
         }
     }
 
-    fn jacobian(&self, batch: &TracedBatch<L, D, C>, lane: usize, seed: [f32; 3]) -> [f32; 9] {
+    fn jacobian(&self, batch: &TracedBatch<L, D, C>, lane: usize, seed: DomainPoint) -> [f32; 9] {
         let factor = batch.exponent.lane(lane).to_f64().exp2();
         let gradient: [[f64; C]; C] = batch.gradient.map(|row| row.map(|entry| entry.lane(lane).to_f64() * factor));
         let state = batch.state.map(|x| x.lane(lane).to_f64());
-        let jacobian = self.field.coordinate_jacobian(seed.map(f64::from), &state, gradient);
+        let jacobian = self.field.coordinate_jacobian(seed.0.map(f64::from), &state, gradient);
         std::array::from_fn(|i| {
             let (row, column) = (i / 3, i % 3);
             if row < C && column < C { jacobian[row][column] as f32 } else { f32::from(u8::from(row == column)) }
@@ -218,11 +218,11 @@ where
     fn has_missing(&self) -> bool {
         !self.missing_cells.is_empty()
     }
-    fn is_missing(&self, seed: [f32; 3]) -> bool {
+    fn is_missing(&self, seed: DomainPoint) -> bool {
         self.missing_cells.is_missing(seed)
     }
 
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) {
         let double = size_of::<L::Real>() == size_of::<f64>();
         out.set_len(seeds.len(), extras, double);
         let threads = rayon::current_num_threads();
@@ -239,7 +239,7 @@ where
             let chunk = (seeds.len() / (8 * threads)).next_multiple_of(L::LANES).clamp(L::LANES, CHUNK);
             (0..seeds.len().div_ceil(chunk)).into_par_iter().for_each(|c| {
                 progress::mark();
-                let mut points = [[0.0f32; 3]; MAX_LANES];
+                let mut points = [DomainPoint::default(); MAX_LANES];
                 let mut indices = [0usize; MAX_LANES];
                 let end = ((c + 1) * chunk).min(seeds.len());
                 for from in (c * chunk..end).step_by(L::LANES) {

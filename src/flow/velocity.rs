@@ -1,13 +1,13 @@
 //! The traits that an integrator needs of a flow, and their implementation for closed forms.
 
 use super::Boundary;
-use ridgewatch_field::{Domain, analytic::ClosedForm};
+use ridgewatch_field::{Domain, DomainPoint, analytic::ClosedForm};
 use ridgewatch_simd::{Lanes, Mask, Real, array};
 
 /// Coordinates of the integration: seeds become states, states become arrival points. A state has `D` components, its tangent `C` columns.
 pub trait Coordinates<const D: usize, const C: usize>: Send + Sync {
     /// Sort key: seeds with neighbouring keys read neighbouring memory. `None` if the flow reads no memory.
-    fn sort_key(&self, point: [f32; 3]) -> Option<u32>;
+    fn sort_key(&self, point: DomainPoint) -> Option<u32>;
     /// State of a particle that starts at a point in domain coordinates.
     fn seed_state(&self, point: [f64; 3]) -> [f64; D];
     /// d state / d seed along an orthonormal basis at the seed.
@@ -15,7 +15,7 @@ pub trait Coordinates<const D: usize, const C: usize>: Send + Sync {
     /// Distance, in the unit of [`Coordinates::initial_tangent`], between the points `step` coordinate units to either side along `axis`.
     fn separation(&self, point: [f64; 3], axis: usize, step: f64) -> f64;
     /// Domain coordinates of a state; extruded axes keep the coordinate of the seed.
-    fn arrival_point(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3];
+    fn arrival_point(&self, state: &[f64; D], seed: DomainPoint) -> DomainPoint;
     /// Converts a flow map gradient between orthonormal bases to domain coordinates.
     fn coordinate_jacobian(&self, seed: [f64; 3], state: &[f64; D], gradient: [[f64; C]; C]) -> [[f64; C]; C];
     /// Times at which the time derivative of the velocity jumps, ascending.
@@ -103,7 +103,7 @@ pub fn within<L: Lanes, const D: usize>(bounds: &[[L::Real; D]; 2], x: &[L; D]) 
 }
 
 impl<F: ClosedForm<D>, R: Real, const D: usize> Coordinates<D, D> for ClosedFormFlow<F, R, D> {
-    fn sort_key(&self, _: [f32; 3]) -> Option<u32> {
+    fn sort_key(&self, _: DomainPoint) -> Option<u32> {
         None
     }
     fn seed_state(&self, point: [f64; 3]) -> [f64; D] {
@@ -115,8 +115,8 @@ impl<F: ClosedForm<D>, R: Real, const D: usize> Coordinates<D, D> for ClosedForm
     fn separation(&self, _: [f64; 3], _: usize, step: f64) -> f64 {
         2.0 * step
     }
-    fn arrival_point(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
-        array(|k| state.get(k).map_or(seed[k], |&x| x as f32))
+    fn arrival_point(&self, state: &[f64; D], seed: DomainPoint) -> DomainPoint {
+        DomainPoint(array(|k| state.get(k).map_or(seed.0[k], |&x| x as f32)))
     }
     fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], gradient: [[f64; D]; D]) -> [[f64; D]; D] {
         gradient

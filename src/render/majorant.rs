@@ -6,6 +6,7 @@
 //! the extinction exceeds its majorant (see `tracking`).
 
 use super::Transfer;
+use crate::GridPoint;
 use rayon::prelude::*;
 use ridgewatch_field::Domain;
 use std::sync::atomic::Ordering::Relaxed;
@@ -132,10 +133,10 @@ impl MajorantGrid {
         self.may_be_missing[cell]
     }
 
-    /// Index of the cell at grid coordinates.
+    /// Index of the cell around a point.
     #[inline]
-    pub(super) fn cell_at(&self, point: [f32; 3]) -> usize {
-        let [x, y, z] = std::array::from_fn(|k| (point[k] as usize).min(self.cells[k] - 1));
+    pub(super) fn cell_at(&self, point: GridPoint) -> usize {
+        let [x, y, z] = std::array::from_fn(|k| (point.0[k] as usize).min(self.cells[k] - 1));
         (z * self.cells[1] + y) * self.cells[0] + x
     }
 
@@ -307,7 +308,11 @@ mod tests {
         // Floor 0.02 + 8/8000 of 100; f32 rounding.
         assert!((grid.majorants()[0] - 2.1).abs() < 1e-4);
         assert!(grid.may_be_missing(0) && !grid.may_be_missing(1));
-        assert_eq!((grid.cell_at([0.9, 0.5, 0.5]), grid.cell_at([2.0, 1.0, 1.0])), (0, 1), "the far walls belong to the last cells");
+        assert_eq!(
+            (grid.cell_at(GridPoint([0.9, 0.5, 0.5])), grid.cell_at(GridPoint([2.0, 1.0, 1.0]))),
+            (0, 1),
+            "the far walls belong to the last cells"
+        );
     }
 
     #[test]

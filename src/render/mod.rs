@@ -6,6 +6,8 @@
 //! the light by ratio tracking (Novak et al. 2014), both through a grid of majorants. All flights advance together as a wavefront, so that
 //! queries come in large batches.
 
+use ridgewatch_field::DomainPoint;
+
 mod albedo;
 mod camera;
 mod error;
@@ -36,13 +38,13 @@ pub use scene::Scene;
 pub use settings::MAX_FRAMES_UNTIL;
 pub use settings::MAX_SAMPLES;
 pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
-pub use space::{SceneBox, overview_scale};
+pub use space::{GridPoint, SceneBox, overview_scale};
 pub use tracking::FrameScene;
 pub use transfer::Transfer;
 
 /// Answers log-stretch queries. The renderer passes the collision points of one wavefront step per call.
 pub trait LogStretch {
-    /// Writes the log-stretch at each point (domain coordinates) to `log_stretch`, and to `traced` whether RK4 traced it (true) or a surrogate
+    /// Writes the log-stretch at each point to `log_stretch`, and to `traced` whether RK4 traced it (true) or a surrogate
     /// predicted it (false). All three slices have the same length. NaN marks a point in a missing cell, which is empty space and is counted.
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]);
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]);
 }

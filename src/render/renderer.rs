@@ -12,7 +12,7 @@ use super::tracking::{FrameScene, PHASE};
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
 use super::{Camera, Light, LogStretch, Scene, Transfer};
 use rayon::prelude::*;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint};
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -147,9 +147,9 @@ impl Renderer {
         Ok(())
     }
 
-    /// Records log-stretch values known from elsewhere (a traced table, audit points; domain coordinates) in the majorants, from the next frame
+    /// Records log-stretch values known from elsewhere (a traced table, audit points) in the majorants, from the next frame
     /// on. Without observations the first frame needs several times as many queries.
-    pub fn observe(&self, points: &[[f32; 3]], log_stretch: &[f32]) {
+    pub fn observe(&self, points: &[DomainPoint], log_stretch: &[f32]) {
         points.par_iter().with_min_len(1 << 12).zip(log_stretch).for_each(|(point, &s)| {
             let cell = self.majorants.cell_at(self.space.grid_of_domain(*point));
             if s.is_finite() { self.majorants.observe(cell, s * self.inverse_tau) } else { self.majorants.observe_missing(cell) }
@@ -379,7 +379,7 @@ fn advance(groups: &mut [FlightGroup], scene: &FrameScene, log_stretch: &[f32], 
 }
 
 /// Collects the points of all groups in one batch.
-fn gather(groups: &[FlightGroup], points: &mut Vec<[f32; 3]>) {
+fn gather(groups: &[FlightGroup], points: &mut Vec<DomainPoint>) {
     points.clear();
     groups.iter().for_each(|group| points.extend_from_slice(&group.points));
 }

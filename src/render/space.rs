@@ -1,6 +1,19 @@
-//! The three frames of reference: domain (data coordinates), scene (lengths, for camera, light and extinction) and grid (majorant cells).
+//! The frames of reference: domain and unit (see [`Domain`]), grid (majorant cells), and scene (lengths in f64, for camera, light and extinction).
 
-use ridgewatch_field::{Domain, VERTICAL_EDGE};
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint, VERTICAL_EDGE};
+
+/// A point in grid coordinates: majorant cells from the lower corner of the box, along each axis from 0 to the number of cells. [`SceneBox`] converts.
+#[repr(transparent)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, bytemuck::Pod, bytemuck::Zeroable)]
+pub struct GridPoint(pub [f32; 3]);
+
+impl GridPoint {
+    /// The point at distance `t` along a direction in cells per scene length.
+    #[inline]
+    pub fn along(self, direction: [f32; 3], t: f32) -> Self {
+        Self(std::array::from_fn(|k| self.0[k] + t * direction[k]))
+    }
+}
 
 /// Factors per axis from domain to scene coordinates for default views: the longer of the edges along x and y becomes 1, and their ratio is
 /// kept. The third axis keeps its ratio too ([`Domain::lengths`]), unless the flow is two-dimensional (the thickness of the slab has no
@@ -73,14 +86,14 @@ impl SceneBox {
 
     /// Unit coordinates of grid coordinates.
     #[inline]
-    pub fn unit_of_grid(&self, grid: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| grid[k] / self.cells[k] as f32)
+    pub fn unit_of_grid(&self, grid: GridPoint) -> UnitPoint {
+        UnitPoint(self.unit_direction(grid.0))
     }
 
     /// Grid coordinates of unit coordinates.
     #[inline]
-    pub fn grid_of_unit(&self, unit: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| unit[k] * self.cells[k] as f32)
+    pub fn grid_of_unit(&self, unit: UnitPoint) -> GridPoint {
+        GridPoint(std::array::from_fn(|k| unit.0[k] * self.cells[k] as f32))
     }
 
     /// Distances at which a ray enters and leaves the box; `None` if it misses the box or the box lies behind.
@@ -101,15 +114,15 @@ impl SceneBox {
     }
 
     /// Grid coordinates of a scene point, clamped to the grid.
-    pub fn grid_point(&self, point: [f64; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32))
+    pub fn grid_point(&self, point: [f64; 3]) -> GridPoint {
+        GridPoint(std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32)))
     }
 
     /// Grid coordinates of a domain point, clamped to the grid.
-    pub fn grid_of_domain(&self, point: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| {
-            (((f64::from(point[k]) - self.domain_min[k]) / self.cell_extent[k]) as f32).clamp(0.0, self.cells[k] as f32)
-        })
+    pub fn grid_of_domain(&self, point: DomainPoint) -> GridPoint {
+        GridPoint(std::array::from_fn(|k| {
+            (((f64::from(point.0[k]) - self.domain_min[k]) / self.cell_extent[k]) as f32).clamp(0.0, self.cells[k] as f32)
+        }))
     }
 
     /// Converts a scene direction to cells per scene length.
@@ -120,26 +133,32 @@ impl SceneBox {
 
     /// Scene point of grid coordinates.
     #[inline]
-    pub fn scene_point(&self, grid: [f32; 3]) -> [f64; 3] {
-        std::array::from_fn(|k| self.min[k] + f64::from(grid[k]) * self.cell_edge[k])
+    pub fn scene_point(&self, grid: GridPoint) -> [f64; 3] {
+        std::array::from_fn(|k| self.min[k] + f64::from(grid.0[k]) * self.cell_edge[k])
     }
 
     /// Domain point of grid coordinates, clamped to the box.
     #[inline]
-    pub fn domain_point(&self, grid: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| {
-            ((self.domain_min[k] + f64::from(grid[k]) * self.cell_extent[k]) as f32).max(self.inward_min[k]).min(self.inward_max[k])
-        })
+    pub fn domain_point(&self, grid: GridPoint) -> DomainPoint {
+        DomainPoint(std::array::from_fn(|k| {
+            ((self.domain_min[k] + f64::from(grid.0[k]) * self.cell_extent[k]) as f32).max(self.inward_min[k]).min(self.inward_max[k])
+        }))
     }
 
-    /// Scene length along `direction` from `from` (both in grid coordinates) to the end of the grid.
+    /// Converts a grid direction (cells per scene length) to unit coordinates per scene length.
     #[inline]
-    pub fn exit(&self, from: [f32; 3], direction: [f32; 3]) -> f32 {
+    pub fn unit_direction(&self, direction: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| direction[k] / self.cells[k] as f32)
+    }
+
+    /// Scene length along `direction` (cells per scene length) from `from` to the end of the grid.
+    #[inline]
+    pub fn exit(&self, from: GridPoint, direction: [f32; 3]) -> f32 {
         let mut leave = f32::INFINITY;
         for k in 0..3 {
             if direction[k] != 0.0 {
                 let wall = if direction[k] > 0.0 { self.cells[k] as f32 } else { 0.0 };
-                leave = leave.min((wall - from[k]) / direction[k]);
+                leave = leave.min((wall - from.0[k]) / direction[k]);
             }
         }
         leave.max(0.0)
@@ -187,11 +206,11 @@ mod tests {
         // 0.1 and 0.7 round up and down in f32.
         let domain = Domain::cuboid([0.1, 0.7, -0.3], [0.7, 1.1, 0.1]);
         let space = SceneBox::new(&domain, [3.0; 3], [3, 5, 7]);
-        for grid in [[0.0, 0.0, 0.0], [3.0, 5.0, 7.0]] {
+        for grid in [[0.0, 0.0, 0.0], [3.0, 5.0, 7.0]].map(GridPoint) {
             assert!(domain.contains(space.domain_point(grid)), "{grid:?}");
         }
         let middle = space.domain_point(space.grid_point([1.2, 2.7, -0.3]));
-        (0..3).for_each(|k| assert!((middle[k] - [0.4, 0.9, -0.1][k]).abs() < 1e-6, "f32 rounding: {middle:?}"));
+        (0..3).for_each(|k| assert!((middle.0[k] - [0.4, 0.9, -0.1][k]).abs() < 1e-6, "f32 rounding: {middle:?}"));
     }
 
     #[test]

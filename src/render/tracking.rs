@@ -9,7 +9,7 @@ use super::film::PathSample;
 use super::majorant::MajorantGrid;
 use super::parameters::FrameParameters;
 use super::rng::{FrameRandom, unit};
-use super::space::SceneBox;
+use super::space::{GridPoint, SceneBox};
 use super::{Camera, Light, Transfer};
 
 /// Isotropic phase function.
@@ -85,10 +85,10 @@ pub enum Outcome {
     Done(PathSample),
 }
 
-/// A path in flight. Positions are in grid coordinates, `t` in scene lengths from `origin`.
+/// A path in flight, `t` scene lengths from `origin`.
 #[derive(Debug, Clone)]
 pub struct Flight {
-    origin: [f32; 3],
+    origin: GridPoint,
     direction: [f32; 3],
     t: f32,
     end: f32,
@@ -119,7 +119,7 @@ impl Flight {
         let y = 1.0 - (row as f64 + jitter_y) / scene.height as f64 * 2.0;
         let (origin, direction) = scene.camera.ray(x, y);
         let mut flight = Self {
-            origin: [0.0; 3],
+            origin: GridPoint::default(),
             direction: scene.space.grid_direction(direction),
             t: 0.0,
             end: 0.0,
@@ -145,10 +145,10 @@ impl Flight {
         (flight, outcome)
     }
 
-    /// Grid coordinates of the tentative collision.
+    /// The tentative collision.
     #[inline]
-    pub fn point(&self) -> [f32; 3] {
-        std::array::from_fn(|k| self.origin[k] + self.t * self.direction[k])
+    pub fn point(&self) -> GridPoint {
+        self.origin.along(self.direction, self.t)
     }
 
     /// Draws an optical depth and advances the flight to the next tentative collision or to its end.
@@ -267,10 +267,10 @@ pub struct Hit {
     pub majorant: f32,
 }
 
-/// Traverses the grid from `t` along `origin + t direction` (grid coordinates) until the majorants integrate to `depth`; `None` if that is
+/// Traverses the grid from `t` along `origin + t direction` until the majorants integrate to `depth`; `None` if that is
 /// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 #[inline]
-pub fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
+pub fn walk(grid: &MajorantGrid, origin: GridPoint, direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
     let cells = grid.cells();
     let majorants = grid.majorants();
     let strides = [1, cells[0] as isize, (cells[0] * cells[1]) as isize];
@@ -278,13 +278,13 @@ pub fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f
     // Per axis: cells left before the ray leaves the grid, t of the next cell wall, and the difference in t between walls.
     let (mut left, mut wall, mut wall_spacing, mut step) = ([0_i32; 3], [f32::INFINITY; 3], [0.0_f32; 3], [0_isize; 3]);
     for k in 0..3 {
-        let place = origin[k] + t * direction[k];
+        let place = origin.0[k] + t * direction[k];
         let cell = (place as i32).clamp(0, cells[k] as i32 - 1);
         index += cell as isize * strides[k];
         if direction[k] != 0.0 {
             let ahead = direction[k] > 0.0;
             let inverse = 1.0 / direction[k];
-            wall[k] = ((cell + i32::from(ahead)) as f32 - origin[k]) * inverse;
+            wall[k] = ((cell + i32::from(ahead)) as f32 - origin.0[k]) * inverse;
             wall_spacing[k] = inverse.abs();
             left[k] = if ahead { cells[k] as i32 - 1 - cell } else { cell };
             step[k] = if ahead { strides[k] } else { -strides[k] };

@@ -12,7 +12,7 @@ fn graded(cells: [usize; 3]) -> MajorantGrid {
 }
 
 /// Cells visited on the way out, found by asking for ever larger depths.
-fn visited(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], end: f32) -> Vec<u32> {
+fn visited(grid: &MajorantGrid, origin: GridPoint, direction: [f32; 3], end: f32) -> Vec<u32> {
     let mut cells: Vec<u32> = Vec::new();
     for i in 1..200_000 {
         match walk(grid, origin, direction, 0.0, end, i as f32 * 1e-3) {
@@ -27,11 +27,11 @@ fn visited(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], end: f32)
 #[test]
 fn walks_visit_the_cells_on_the_line() {
     let grid = graded([4, 3, 2]);
-    assert_eq!(visited(&grid, [0.0, 0.5, 0.5], [1.0, 0.0, 0.0], 4.0), [0, 1, 2, 3]);
-    assert_eq!(visited(&grid, [4.0, 1.5, 1.5], [-1.0, 0.0, 0.0], 4.0), [19, 18, 17, 16]);
+    assert_eq!(visited(&grid, GridPoint([0.0, 0.5, 0.5]), [1.0, 0.0, 0.0], 4.0), [0, 1, 2, 3]);
+    assert_eq!(visited(&grid, GridPoint([4.0, 1.5, 1.5]), [-1.0, 0.0, 0.0], 4.0), [19, 18, 17, 16]);
     // From (0, 0.5) up at slope 1/2: crosses x = 1 at y = 1 together; then x = 2 at 1.5, y = 2 and x = 3 together.
-    assert_eq!(visited(&grid, [0.2, 0.5, 0.1], [2.0, 1.0, 0.0], 1.5), [0, 1, 5, 6, 7]);
-    assert_eq!(visited(&grid, [0.5, 0.5, 0.5], [0.0, 0.0, 1.0], 1.0), [0, 12], "ends inside the last cell");
+    assert_eq!(visited(&grid, GridPoint([0.2, 0.5, 0.1]), [2.0, 1.0, 0.0], 1.5), [0, 1, 5, 6, 7]);
+    assert_eq!(visited(&grid, GridPoint([0.5, 0.5, 0.5]), [0.0, 0.0, 1.0], 1.0), [0, 12], "ends inside the last cell");
 }
 
 #[test]
@@ -42,13 +42,13 @@ fn walks_add_up_the_majorants() {
     for case in 0..200 {
         let words = random.words(case, 0, 0).map(unit);
         let more = random.words(case, 1, 0).map(unit);
-        let origin = [words[0] * 5.0, words[1] * 4.0, words[2] * 3.0];
+        let origin = GridPoint([words[0] * 5.0, words[1] * 4.0, words[2] * 3.0]);
         let direction = [more[0] - 0.5, more[1] - 0.5, more[2] - 0.5];
         let wanted = words[3] * 60.0;
         let (mut depth, mut t) = (0.0_f64, 0.0_f64);
         let step = 1e-4;
         let marched = loop {
-            let place: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k]) + (t + 0.5 * step) * f64::from(direction[k]));
+            let place: [f64; 3] = std::array::from_fn(|k| f64::from(origin.0[k]) + (t + 0.5 * step) * f64::from(direction[k]));
             if (0..3).any(|k| place[k] < 0.0 || place[k] >= grid.cells()[k] as f64) {
                 break None;
             }
@@ -73,7 +73,7 @@ fn walks_add_up_the_majorants() {
 fn a_restarted_walk_finds_the_same_place() {
     let grid = graded([8, 8, 8]);
     let direction = [0.3, 0.8, -0.5];
-    let origin = [1.0, 0.0, 8.0];
+    let origin = GridPoint([1.0, 0.0, 8.0]);
     let whole = walk(&grid, origin, direction, 0.0, 9.0, 900.0).unwrap();
     let mut t = 0.0;
     for _ in 0..30 {

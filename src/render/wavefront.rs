@@ -6,6 +6,7 @@
 
 use super::film::{Film, PathSample, Pixel};
 use super::tracking::{Flight, FrameScene, Outcome};
+use ridgewatch_field::DomainPoint;
 use std::collections::VecDeque;
 
 /// Capacity of the ring buffer of results per flight. It limits how many later paths wait for a long one.
@@ -34,8 +35,8 @@ pub(super) struct PathCounts {
 pub(super) struct FlightGroup {
     capacity: usize,
     flights: Vec<Flight>,
-    /// Domain coordinates of the flights' tentative collisions.
-    pub(super) points: Vec<[f32; 3]>,
+    /// The flights' tentative collisions.
+    pub(super) points: Vec<DomainPoint>,
     results: Vec<Option<PathSample>>,
     started: u64,
     retired: u64,

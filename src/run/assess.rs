@@ -140,12 +140,16 @@ fn tolerance_excess(tally: &Tally, trusted: Option<TrustedError>, audited: &Audi
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::field::UnitPoint;
     use crate::trust::Residual;
 
     /// Ten points left of the middle, trusted or not, whose residual is 0.01, ten right of it with 0.05.
     fn points() -> Vec<Residual> {
-        let at =
-            |i: usize| Residual { point: [(i as f32 + 0.5) / 20.0, 0.5, 0.5], optical: if i < 10 { 0.01 } else { 0.05 }, log_stretch: 0.0 };
+        let at = |i: usize| Residual {
+            point: UnitPoint([(i as f32 + 0.5) / 20.0, 0.5, 0.5]),
+            optical: if i < 10 { 0.01 } else { 0.05 },
+            log_stretch: 0.0,
+        };
         (0..20).map(at).collect()
     }
 

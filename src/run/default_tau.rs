@@ -2,7 +2,7 @@
 
 use super::RunError;
 use crate::backend::stratified_points;
-use crate::field::{Snapshot, Window};
+use crate::field::{DomainPoint, Snapshot, Window};
 use crate::flow::{Direction, Extras, FlowMap, Normalisation, Steps, Traced, VelocitySource, cpu_tracer};
 use crate::source::SnapshotSource;
 use crate::trust::Strata;
@@ -96,7 +96,7 @@ impl Shares {
         let cells = if tracer.domain().dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
         // Not the seed of the picture, which would change the flow map.
         let unit = stratified_points(&Strata::even(cells, 1), 0, STREAM);
-        let mut points: Vec<[f32; 3]> = unit.into_iter().map(|unit| tracer.domain().from_unit(unit)).collect();
+        let mut points: Vec<DomainPoint> = unit.into_iter().map(|unit| tracer.domain().from_unit(unit)).collect();
         points.retain(|&point| !tracer.is_missing(point));
         if points.is_empty() {
             return Ok(None);

@@ -8,6 +8,7 @@ use super::transaction::{On, present};
 use crate::backend::{
     Backend, FrameJob, FrameSamples, Interruptible, Rendered, Routing, Surrogate, SurrogateRequest, audit, residuals, stratified_points,
 };
+use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
 use crate::render::Method;
 use crate::surrogate::network::{Input, uniform};
@@ -163,7 +164,8 @@ impl Run<'_> {
         let domain = on.tracer().flow().domain();
         let renderer = &mut self.renderer;
         self.threads.render().install(|| {
-            let points: Vec<[f32; 3]> = probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
+            let points: Vec<DomainPoint> =
+                probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
             renderer.observe(&points, &probe.samples.log_stretch);
         });
         self.progress.preparation_traces += probe.drawn as u64;
@@ -277,7 +279,7 @@ impl Run<'_> {
         let mut chosen = self.learning.buffer.probe(PROBES, self.plan.scene.seed, self.progress.frame);
         // This tracer cannot test labels of shorter durations; they are assumed to hold if the others do.
         chosen.retain(|&i| labels.times_of(i)[1] == 1.0);
-        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| flow.domain().from_unit(labels.points[i])).collect();
+        let points: Vec<DomainPoint> = chosen.iter().map(|&i| flow.domain().from_unit(labels.points[i])).collect();
         let mut traced = Traced::default();
         let interruptible = Interruptible::new(on.tracer(), self.stop);
         self.threads.render().install(|| interruptible.trace(&points, Extras::default(), &mut traced))?;

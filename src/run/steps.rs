@@ -3,6 +3,7 @@
 use super::setup::Plan;
 use super::slides::Slide;
 use crate::backend::stratified_points;
+use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
 use crate::render::Transfer;
 use crate::trust::Strata;
@@ -91,7 +92,7 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
 struct Comparison<'a> {
     shown: Shown<'a>,
     slide: &'a Slide,
-    points: Vec<[f32; 3]>,
+    points: Vec<DomainPoint>,
     truth: Traced,
 }
 

@@ -7,6 +7,7 @@ use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::trace::Trace;
 use super::{Kind, Predict, ReplayBuffer, Table};
 use ridgewatch_base::DeviceError;
+use ridgewatch_field::UnitPoint;
 use std::sync::Arc;
 
 /// One device, with its types for the parts of a surrogate.
@@ -28,7 +29,7 @@ pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     ///
     /// # Errors
     /// The device fails or lacks memory; `out` is then unspecified.
-    fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
+    fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError>;
 }
 
 /// An immutable copy of a surrogate. Frames are rendered with it while training continues.
@@ -52,7 +53,7 @@ impl<D: SurrogateDevice> Predict for FrozenHybrid<D> {
         self.kind.name()
     }
 
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         D::predict(self, points, out)
     }
 

@@ -8,7 +8,7 @@ use super::network::{Architecture, Average, Field, Fused, Model, Objective, Plan
 use super::trace::Trace;
 use super::{Kind, NetworkSettings, SurrogateError, SurrogateSettings, Table};
 use ridgewatch_base::DeviceError;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, UnitPoint};
 use std::sync::Arc;
 
 /// The CPU as a surrogate's device. Its calls never fail.
@@ -29,7 +29,7 @@ impl SurrogateDevice for Host {
         }
     }
 
-    fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         match (&frozen.table, &frozen.network) {
             (Some(table), None) => table.interpolate(points, out),
             (None, Some(network)) => network.predict(points, frozen.times, out),
@@ -107,7 +107,7 @@ pub struct FrozenNetwork {
 
 impl FrozenNetwork {
     /// Writes the log-stretch at unit points, for these unit times.
-    pub fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) {
+    pub fn predict(&self, points: &[UnitPoint], times: [f32; 2], out: &mut [f32]) {
         self.predictor.log_stretch(&self.shape, &self.objective, &self.average.tables, points, times, out);
     }
 }

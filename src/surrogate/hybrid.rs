@@ -12,6 +12,7 @@ use super::trace::Trace;
 use super::trainer::Trainer;
 use super::{CheckpointError, Kind, Learned, Predict, ReplayBuffer, Samples, SurrogateError, fresh_stamp};
 use ridgewatch_base::DeviceError;
+use ridgewatch_field::UnitPoint;
 use std::path::Path;
 use std::time::Instant;
 
@@ -36,7 +37,7 @@ impl<D: SurrogateDevice> Predict for Hybrid<D> {
         self.kind.name()
     }
 
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         self.freeze()?.predict(points, out)
     }
 
@@ -178,9 +179,9 @@ impl<D: SurrogateDevice> Hybrid<D> {
     /// Least-squares factor on the held-out samples. Training noise is independent of them and thus lowers the factor.
     fn fitted_shrinkage(&self, samples: &Samples) -> Result<f32, DeviceError> {
         let stride = HELD_OUT * (samples.len() / HELD_OUT / MAX_COMPARED).max(1);
-        let finite = |&i: &usize| samples.log_stretch[i].is_finite() && samples.points[i].iter().all(|x| x.is_finite());
+        let finite = |&i: &usize| samples.log_stretch[i].is_finite() && samples.points[i].0.iter().all(|x| x.is_finite());
         let chosen: Vec<usize> = (0..samples.len()).step_by(stride).filter(finite).collect();
-        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| samples.points[i]).collect();
+        let points: Vec<UnitPoint> = chosen.iter().map(|&i| samples.points[i]).collect();
         let (mut below, mut sum) = (vec![0.0; points.len()], vec![0.0; points.len()]);
         let frozen = self.freeze()?;
         FrozenHybrid { network: None, ..frozen.parts() }.predict(&points, &mut below)?;

@@ -5,7 +5,7 @@
 use network::NetworkSettings;
 use ridgewatch_base::DeviceError;
 use ridgewatch_base::setting::Refused;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, UnitPoint};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -38,15 +38,15 @@ pub fn fresh_stamp() -> u64 {
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-/// Traced samples to learn from. Positions are unit coordinates ([`ridgewatch_field::Domain::to_unit`]).
+/// Traced samples to learn from.
 #[derive(Debug, Clone, Default)]
 pub struct Samples {
-    /// Unit coordinates in [0, 1]^3.
-    pub points: Vec<[f32; 3]>,
+    /// Where they were traced, in [0, 1]^3.
+    pub points: Vec<UnitPoint>,
     /// Log-stretch of each.
     pub log_stretch: Vec<f32>,
-    /// Arrival positions in unit coordinates (may lie outside [0, 1]); empty unless the target is the flow map.
-    pub arrival: Vec<[f32; 3]>,
+    /// Arrival positions (may lie outside [0, 1]); empty unless the target is the flow map.
+    pub arrival: Vec<UnitPoint>,
     /// d arrival / d point in unit coordinates, row-major; empty unless the target is the flow map.
     pub jacobian: Vec<[f32; 9]>,
     /// Start time and duration of each in unit intervals ([`network::Times`]); empty if all samples have the same.
@@ -133,13 +133,13 @@ pub trait Predict: Send + Sync {
     ///
     /// # Errors
     /// The device that predicts fails or is out of memory; `out` is then unspecified.
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
+    fn predict(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError>;
 
     /// Predicts at unit points and returns the seconds that the processor takes. Copies to and from a device do not count.
     ///
     /// # Errors
     /// As [`Predict::predict`].
-    fn seconds(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<f64, DeviceError> {
+    fn seconds(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<f64, DeviceError> {
         let began = std::time::Instant::now();
         self.predict(points, out)?;
         Ok(began.elapsed().as_secs_f64())

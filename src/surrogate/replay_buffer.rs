@@ -193,10 +193,11 @@ fn overwrite(to: &mut Samples, at: usize, from: &Samples, index: usize, now: Opt
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ridgewatch_field::UnitPoint;
 
     fn numbered(range: std::ops::Range<u32>) -> Samples {
         Samples {
-            points: range.clone().map(|i| [i as f32, 0.0, 0.0]).collect(),
+            points: range.clone().map(|i| UnitPoint([i as f32, 0.0, 0.0])).collect(),
             log_stretch: range.map(|i| i as f32).collect(),
             ..Samples::default()
         }
@@ -217,7 +218,7 @@ mod tests {
         buffer.push(&numbered(100..125));
         assert_eq!(labels(buffer.samples()), (115..125).collect::<Vec<_>>());
         assert_eq!((buffer.len(), buffer.pushed()), (10, 38));
-        assert!(buffer.samples().points.iter().zip(&buffer.samples().log_stretch).all(|(p, s)| p[0] == *s));
+        assert!(buffer.samples().points.iter().zip(&buffer.samples().log_stretch).all(|(p, s)| p.0[0] == *s));
     }
 
     #[test]
@@ -268,12 +269,12 @@ mod tests {
     fn flow_map_labels_travel_along() {
         let mut buffer = ReplayBuffer::new(4);
         let mut samples = numbered(0..6);
-        samples.arrival = (0..6).map(|i| [i as f32; 3]).collect();
+        samples.arrival = (0..6).map(|i| UnitPoint([i as f32; 3])).collect();
         samples.jacobian = (0..6).map(|i| [i as f32; 9]).collect();
         buffer.push(&samples);
         buffer.push(&samples);
         let held = buffer.samples();
-        assert!((0..4).all(|i| held.arrival[i][1] == held.log_stretch[i] && held.jacobian[i][8] == held.log_stretch[i]));
+        assert!((0..4).all(|i| held.arrival[i].0[1] == held.log_stretch[i] && held.jacobian[i][8] == held.log_stretch[i]));
         buffer.push(&numbered(6..8));
         assert_eq!((buffer.len(), buffer.samples().arrival.len()), (2, 0));
     }

@@ -6,6 +6,7 @@ use super::network::Field;
 use super::trace::Trace;
 use rayon::prelude::*;
 use ridgewatch_base::DeviceError;
+use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, Traced};
 use std::sync::Arc;
 use wide::{f32x8, i32x8};
@@ -47,10 +48,10 @@ impl Table {
     /// The tracer's device fails; values are then unspecified.
     pub fn retrace(&mut self, tracer: &dyn Trace) -> Result<(), DeviceError> {
         let (nodes, dimensions, domain) = (self.nodes, self.dimensions, tracer.flow().domain());
-        let unit = |index: usize| -> [f32; 3] {
+        let unit = |index: usize| -> UnitPoint {
             let node = [index % nodes[0], index / nodes[0] % nodes[1], index / (nodes[0] * nodes[1])];
             // Two-dimensional flows are traced in the middle of the slab.
-            std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 })
+            UnitPoint(std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 }))
         };
         let mut traced = Traced::default();
         self.not_finite = 0;
@@ -61,7 +62,7 @@ impl Table {
         }
         for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
             let first = part * TRACE_AT_ONCE;
-            let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
+            let seeds: Vec<DomainPoint> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
             tracer.trace(&seeds, Extras::default(), &mut traced)?;
             for (value, &traced) in values.iter_mut().zip(&traced.log_stretch) {
                 // A NaN would spread to all adjacent cells. Zero stretch is the value of a particle at rest.
@@ -88,7 +89,7 @@ impl Table {
     }
 
     /// Interpolates at eight points.
-    fn lookup<const D: usize>(&self, values: &[f32], points: &[[f32; 3]; 8]) -> [f32; 8] {
+    fn lookup<const D: usize>(&self, values: &[f32], points: &[UnitPoint; 8]) -> [f32; 8] {
         let (zero, one) = (f32x8::splat(0.0), f32x8::splat(1.0));
         let mut base = i32x8::splat(0);
         let mut fraction = [zero; D];
@@ -96,7 +97,7 @@ impl Table {
         let mut step = 1;
         for axis in 0..D {
             let cells = (self.nodes[axis] - 1) as i32;
-            let x = f32x8::from(std::array::from_fn(|lane| points[lane][axis]));
+            let x = f32x8::from(std::array::from_fn(|lane| points[lane].0[axis]));
             let position = x.fast_max(zero).fast_min(one) * f32x8::splat(cells as f32);
             let cell = position.fast_trunc_int().max(i32x8::splat(0)).min(i32x8::splat(cells - 1));
             fraction[axis] = position - f32x8::from_i32x8(cell);
@@ -115,9 +116,9 @@ impl Table {
         value.to_array()
     }
 
-    fn predict_chunk(&self, values: &[f32], points: &[[f32; 3]], out: &mut [f32]) {
+    fn predict_chunk(&self, values: &[f32], points: &[UnitPoint], out: &mut [f32]) {
         for (points, out) in points.chunks(8).zip(out.chunks_mut(8)) {
-            let mut eight = [[0.0; 3]; 8];
+            let mut eight = [UnitPoint::default(); 8];
             eight[..points.len()].copy_from_slice(points);
             let found = if self.dimensions == 2 { self.lookup::<2>(values, &eight) } else { self.lookup::<3>(values, &eight) };
             out.copy_from_slice(&found[..out.len()]);
@@ -125,7 +126,7 @@ impl Table {
     }
 
     /// Writes the interpolated value at each unit point into `out` (same length). Points outside the domain take the value at its edge.
-    pub fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) {
+    pub fn interpolate(&self, points: &[UnitPoint], out: &mut [f32]) {
         assert_eq!(points.len(), out.len(), "one value a point");
         points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(&self.values, points, out));
     }
@@ -146,7 +147,7 @@ impl Table {
 }
 
 impl Field for Table {
-    fn values(&self, points: &[[f32; 3]], out: &mut [f32]) {
+    fn values(&self, points: &[UnitPoint], out: &mut [f32]) {
         self.predict_chunk(&self.values, points, out);
     }
 }
@@ -173,15 +174,15 @@ mod tests {
         fn steps(&self) -> usize {
             1
         }
-        fn trace(&self, seeds: &[[f32; 3]], _: Extras, out: &mut Traced) {
-            let value = |p: [f32; 3]| if p[0] < self.1 { f32::NAN } else { 1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2] };
+        fn trace(&self, seeds: &[DomainPoint], _: Extras, out: &mut Traced) {
+            let value = |UnitPoint(p)| if p[0] < self.1 { f32::NAN } else { 1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2] };
             out.log_stretch = seeds.iter().map(|&s| value(self.0.to_unit(s))).collect();
         }
     }
 
-    fn points(count: u64) -> Vec<[f32; 3]> {
+    fn points(count: u64) -> Vec<UnitPoint> {
         let random = |i| super::super::network::uniform(5, i);
-        (0..count).map(|i| [random(3 * i), random(3 * i + 1), random(3 * i + 2)]).collect()
+        (0..count).map(|i| UnitPoint([random(3 * i), random(3 * i + 1), random(3 * i + 2)])).collect()
     }
 
     #[test]
@@ -189,13 +190,13 @@ mod tests {
         let tracer = Plane(Domain::cuboid([-1.0, 0.0, 2.0], [3.0, 1.0, 5.0]), -1.0);
         let table = Table::trace(&tracer, [5, 3, 4]).unwrap();
         let mut points = points(1003);
-        points.push([1.0; 3]);
-        points.push([0.0; 3]);
+        points.push(UnitPoint([1.0; 3]));
+        points.push(UnitPoint([0.0; 3]));
         let mut out = vec![0.0; points.len()];
         table.interpolate(&points, &mut out);
         for (p, value) in points.iter().zip(out) {
             // A few roundings of values up to 10.
-            assert!((value - (1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2])).abs() < 1e-5, "{p:?} {value}");
+            assert!((value - (1.0 + 2.0 * p.0[0] + 3.0 * p.0[1] + 4.0 * p.0[2])).abs() < 1e-5, "{p:?} {value}");
         }
         assert_eq!(table.values().len(), 5 * 3 * 4);
     }
@@ -206,7 +207,7 @@ mod tests {
         let table = Table::trace(&tracer, [3, 3, 77]).unwrap();
         assert_eq!(table.nodes(), [3, 3, 1]);
         let mut out = [0.0; 4];
-        table.interpolate(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]], &mut out);
+        table.interpolate(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]].map(UnitPoint), &mut out);
         // The tracer sees the slab's middle: z = 0.5 adds 2. NaN is clamped like a point below the domain.
         assert_eq!(out, [4.75, 4.75, 5.0, 3.0]);
     }

@@ -146,10 +146,15 @@ impl Audited {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ridgewatch_field::UnitPoint;
 
     #[test]
     fn cells_add_up_what_was_drawn_in_them() {
-        let at = |cell: usize, optical: f32| Residual { point: [(cell as f32 + 0.5) / 3.0, 0.5, 0.5], optical, log_stretch: 2.0 * optical };
+        let at = |cell: usize, optical: f32| Residual {
+            point: UnitPoint([(cell as f32 + 0.5) / 3.0, 0.5, 0.5]),
+            optical,
+            log_stretch: 2.0 * optical,
+        };
         let strata = Strata { drawn: vec![4, 2, 1], ..Strata::even([3, 1, 1], 0) };
         let residuals = [at(0, 0.5), at(2, 1.0), at(0, 1.0), at(1, f32::NAN), at(0, 0.0)];
         let audited = Audited::of(&residuals, strata.clone());

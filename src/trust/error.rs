@@ -123,6 +123,7 @@ fn hall_inverse(x: f64, gamma: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ridgewatch_field::UnitPoint;
 
     /// A small deterministic generator: the interval's coverage must not depend on luck.
     fn uniform(state: &mut u64) -> f64 {
@@ -133,7 +134,7 @@ mod tests {
     fn skewed(state: &mut u64) -> Residual {
         // Most points have a tiny residual, one in twenty a large one: the shape that ridges give.
         let optical = if uniform(state) < 0.05 { 0.3 * uniform(state) } else { 0.01 * uniform(state) };
-        Residual { point: [0.5; 3], optical: optical as f32, log_stretch: optical as f32 }
+        Residual { point: UnitPoint([0.5; 3]), optical: optical as f32, log_stretch: optical as f32 }
     }
 
     fn of(residuals: &[Residual], strata: &Strata) -> Option<TrustedError> {
@@ -186,14 +187,15 @@ mod tests {
 
     #[test]
     fn figures_are_those_of_the_sample() {
-        let sample: Vec<Residual> = (1..=100).map(|i| Residual { point: [0.0; 3], optical: i as f32, log_stretch: 2.0 }).collect();
+        let sample: Vec<Residual> =
+            (1..=100).map(|i| Residual { point: UnitPoint([0.0; 3]), optical: i as f32, log_stretch: 2.0 }).collect();
         let e = of(&sample, &Strata::even([1; 3], sample.len() as u32)).unwrap();
         assert_eq!((e.points, e.optical_p99), (100, 99.0));
         // A hundred weighted terms are summed up in f64.
         assert!((e.optical_mean - 50.5).abs() < 1e-9 && (e.log_stretch_rms - 2.0).abs() < 1e-9);
         assert!((e.optical_rms - (338_350f64 / 100.0).sqrt()).abs() < 1e-9);
         assert!(of(&sample[..1], &Strata::even([1; 3], 1)).is_none());
-        let alike = [Residual { point: [0.0; 3], optical: 0.0, log_stretch: 0.0 }; 300];
+        let alike = [Residual { point: UnitPoint([0.0; 3]), optical: 0.0, log_stretch: 0.0 }; 300];
         assert_eq!(of(&alike, &Strata::even([1; 3], 300)).unwrap().optical_rms_interval, [0.0, 0.1]);
     }
 
@@ -211,7 +213,11 @@ mod tests {
             for (cell, &count) in strata.drawn.iter().enumerate() {
                 for _ in 0..count {
                     let optical = uniform(&mut state) * if cell < 4 { 1.0 } else { 0.01 };
-                    sample.push(Residual { point: [(cell as f32 + 0.5) / 16.0, 0.5, 0.5], optical: optical as f32, log_stretch: 1.0 });
+                    sample.push(Residual {
+                        point: UnitPoint([(cell as f32 + 0.5) / 16.0, 0.5, 0.5]),
+                        optical: optical as f32,
+                        log_stretch: 1.0,
+                    });
                 }
             }
             let error = of(&sample, &strata).unwrap();
@@ -244,7 +250,7 @@ mod tests {
                     let large = uniform(&mut state) < 0.005;
                     let optical = if large { 0.3 * uniform(&mut state) } else { 0.0 };
                     sample.push(Residual {
-                        point: [(cell / 20) as f32 / 16.0 + 0.01, 0.5, 0.5],
+                        point: UnitPoint([(cell / 20) as f32 / 16.0 + 0.01, 0.5, 0.5]),
                         optical: optical as f32,
                         log_stretch: 0.0,
                     });

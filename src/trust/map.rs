@@ -5,7 +5,7 @@
 
 use super::strata::{PreviousAudit, Residual, Strata, cell_of};
 use super::{Audited, CellErrors, GateEvidence, REJECTED, TrustSettings, TrustedError};
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, UnitPoint};
 
 /// Decayed sums over the residuals of one cell.
 #[derive(Debug, Clone, Copy, Default)]
@@ -239,7 +239,7 @@ impl Gate {
     }
 
     /// True if the surrogate answers at a unit point.
-    pub fn trusts(&self, point: [f32; 3]) -> bool {
+    pub fn trusts(&self, point: UnitPoint) -> bool {
         self.trusted[cell_of(self.shape, point)]
     }
 
@@ -271,7 +271,7 @@ mod tests {
         let [nx, ny, _] = map.shape();
         let mut residuals = Vec::new();
         for cell in 0..nx * ny {
-            let point = [(cell % nx) as f32 / nx as f32 + 1e-4, (cell / nx) as f32 / ny as f32 + 1e-4, 0.5];
+            let point = UnitPoint([(cell % nx) as f32 / nx as f32 + 1e-4, (cell / nx) as f32 / ny as f32 + 1e-4, 0.5]);
             residuals.extend((0..per_cell).map(|_| Residual { point, optical, log_stretch: 0.0 }));
         }
         map.decay();
@@ -306,7 +306,7 @@ mod tests {
     fn a_bad_cell_is_answered_by_rk4_and_its_neighbours_are_not() {
         let mut map = TrustMap::new(&TrustSettings::default(), &domain());
         filled(&mut map, 0.01, 64);
-        let bad = [0.51, 0.51, 0.0];
+        let bad = UnitPoint([0.51, 0.51, 0.0]);
         map.decay();
         map.observe(
             None,
@@ -314,7 +314,7 @@ mod tests {
         );
         let gate = map.gate();
         assert!(!gate.trusts(bad));
-        assert!(gate.trusts([0.45, 0.51, 0.0]));
+        assert!(gate.trusts(UnitPoint([0.45, 0.51, 0.0])));
         assert!((gate.share() - 511.0 / 512.0).abs() < 1e-12);
     }
 
@@ -346,7 +346,7 @@ mod tests {
         let settings = TrustSettings { audit_max_per_cell: 32, ..TrustSettings::default() };
         let mut map = TrustMap::new(&settings, &domain());
         filled(&mut map, 0.001, 64);
-        let ridge = [0.51, 0.51, 0.0];
+        let ridge = UnitPoint([0.51, 0.51, 0.0]);
         let some: Vec<Residual> =
             (0..200).map(|i| Residual { point: ridge, optical: if i % 20 == 0 { 0.05 } else { 0.001 }, log_stretch: 0.0 }).collect();
         map.observe(None, &some);

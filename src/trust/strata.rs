@@ -1,10 +1,12 @@
 //! The cells of the unit cube as strata: residuals at points, and the numbers of points drawn per cell.
 
+use ridgewatch_field::UnitPoint;
+
 /// Difference between a traced sample and the prediction of a surrogate that has not been trained on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Residual {
-    /// Unit coordinates.
-    pub point: [f32; 3],
+    /// Where the sample lies.
+    pub point: UnitPoint,
     /// |ramp(predicted) - ramp(traced)|, in [0, 1].
     pub optical: f32,
     /// predicted - traced log-stretch.
@@ -32,8 +34,8 @@ pub(super) struct PreviousAudit {
 }
 
 /// Index of the cell of a unit point.
-pub(super) fn cell_of(shape: [usize; 3], point: [f32; 3]) -> usize {
-    let index = |k: usize| ((point[k].clamp(0.0, 1.0) * shape[k] as f32) as usize).min(shape[k] - 1);
+pub(super) fn cell_of(shape: [usize; 3], point: UnitPoint) -> usize {
+    let index = |k: usize| ((point.0[k].clamp(0.0, 1.0) * shape[k] as f32) as usize).min(shape[k] - 1);
     (index(2) * shape[1] + index(1)) * shape[0] + index(0)
 }
 
@@ -58,14 +60,14 @@ impl Strata {
     }
 
     /// Index of the cell of a unit point.
-    pub(super) fn cell(&self, point: [f32; 3]) -> usize {
+    pub(super) fn cell(&self, point: UnitPoint) -> usize {
         cell_of(self.shape, point)
     }
 
-    /// Centre of a cell, in unit coordinates.
-    pub fn centre(&self, cell: usize) -> [f32; 3] {
+    /// Centre of a cell.
+    pub fn centre(&self, cell: usize) -> UnitPoint {
         let [nx, ny, _] = self.shape;
         let index = [cell % nx, cell / nx % ny, cell / (nx * ny)];
-        std::array::from_fn(|k| (index[k] as f32 + 0.5) / self.shape[k] as f32)
+        UnitPoint(std::array::from_fn(|k| (index[k] as f32 + 0.5) / self.shape[k] as f32))
     }
 }

@@ -3,6 +3,7 @@
 use crate::kit::flow::{rotation, trace, window};
 use crate::kit::netcdf::*;
 use crate::open;
+use ridgewatch::field::DomainPoint;
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Traced, VelocitySource};
 use ridgewatch::source::{Archive, Metric, SnapshotSource};
 use std::f64::consts::TAU;
@@ -30,7 +31,7 @@ fn file(path: &Path, latitudes: &[f64]) -> PathBuf {
     Fixture::on(CLASSIC, &axes).winds(wind(0), wind(1)).write(path)
 }
 
-fn traced(archive: &mut Archive, seeds: &[[f32; 3]]) -> Traced {
+fn traced(archive: &mut Archive, seeds: &[DomainPoint]) -> Traced {
     let map = FlowMap {
         precision: Precision::F64,
         boundary: Boundary::Stop,
@@ -50,8 +51,9 @@ fn around(pole: f64, latitudes: &[f64]) {
     assert_eq!(end, pole, "the pole is inside");
     assert!(archive.read(0).unwrap().missing_nodes() == 0);
     // From 40 degrees off the pole up to it: on their way of 30 degrees many cross it.
-    let seeds: Vec<[f32; 3]> =
-        (0..200).map(|i| [(i as f32 * 137.507_76) % 360.0, (pole - pole.signum() * f64::from(i) / 5.0) as f32, 3000.0]).collect();
+    let seeds: Vec<DomainPoint> = (0..200)
+        .map(|i| DomainPoint([(i as f32 * 137.507_76) % 360.0, (pole - pole.signum() * f64::from(i) / 5.0) as f32, 3000.0]))
+        .collect();
     let out = traced(&mut archive, &seeds);
     assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "no particle stops at the pole");
     let worst = out.log_stretch_f64.iter().fold(0.0f64, |m, s| m.max(s.abs()));
@@ -64,7 +66,10 @@ fn around(pole: f64, latitudes: &[f64]) {
     // Slopes of cubics: tests/flow finds 5.9e-5 in the same cells over a way three times as long. Here 2.8e-5 was measured.
     assert!(worst < 5e-5, "{worst:e}");
     // The equator is an edge of a hemisphere only.
-    let out = traced(&mut archive, &[[90.0, 0.5 * pole.signum() as f32, 3000.0], [270.0, 0.5 * pole.signum() as f32, 3000.0]]);
+    let out = traced(
+        &mut archive,
+        &[DomainPoint([90.0, 0.5 * pole.signum() as f32, 3000.0]), DomainPoint([270.0, 0.5 * pole.signum() as f32, 3000.0])],
+    );
     let whole = grid.axes[1].last() - grid.axes[1].first() > 170.0;
     assert_eq!(out.lifetime_share.iter().all(|&l| l == 1.0), whole, "{:?}", out.lifetime_share);
 }

@@ -4,7 +4,7 @@
 use crate::kit::flow::{quasi_random, trace, window};
 use crate::kit::program::{self, project, records, set, text};
 use crate::{inspected, open, refused};
-use ridgewatch::field::Geometry;
+use ridgewatch::field::{DomainPoint, Geometry, UnitPoint};
 use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
 use ridgewatch::publish::read_exr;
 use ridgewatch::render::Film;
@@ -148,7 +148,7 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
     };
     let tracer = cpu_tracer(source.clone(), &map, begin).unwrap();
     // Seeds that stop are left out. More remain than are needed, since a neighbour of some stops.
-    let seeds: Vec<[f32; 3]> = (0..2000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
+    let seeds: Vec<DomainPoint> = (0..2000).map(|i| tracer.domain().from_unit(UnitPoint(quasi_random(i).map(|c| c as f32)))).collect();
     let out = trace(&source, &map, begin, &seeds, Extras::default());
     let chosen: Vec<usize> =
         (0..seeds.len()).filter(|&i| out.lifetime_share[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
@@ -157,7 +157,7 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
         "kind": kind,
         "files": archive.files().map(|f| f.display().to_string()).collect::<Vec<_>>(),
         "count": PAIRS,
-        "points": chosen.iter().map(|&i| seeds[i].map(f64::from)).collect::<Vec<_>>(),
+        "points": chosen.iter().map(|&i| seeds[i].0.map(f64::from)).collect::<Vec<_>>(),
         "from": begin,
         "tau": -tau,
     });
@@ -210,7 +210,7 @@ fn automatic_steps_see_the_kinks_of_linear_interpolation() {
         // As scenes of archives with linear interpolation have it.
         let automatic = with(Steps::AutoByShare { tolerance: 0.1, share: 0.015 });
         let tracer = cpu_tracer(source.clone(), &automatic, begin).unwrap();
-        let seeds: Vec<[f32; 3]> = (0..8000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
+        let seeds: Vec<DomainPoint> = (0..8000).map(|i| tracer.domain().from_unit(UnitPoint(quasi_random(i).map(|c| c as f32)))).collect();
         let of = |steps| trace(&source, &with(Steps::Fixed(steps)), begin, &seeds, Extras::default());
         let (coarse, fine) = (of(tracer.steps()), of(16 * tracer.steps()));
         let whole = |i: &usize| coarse.lifetime_share[*i] == 1.0 && fine.lifetime_share[*i] == 1.0 && !tracer.is_missing(seeds[*i]);

@@ -1,7 +1,7 @@
 //! The standard turbulence, written in the shapes of archives and read back: the FTLE is that of the closed form.
 
 use crate::kit::flow::{direction, dot, quasi_random, trace, unit, window};
-use ridgewatch::field::turbulence::Turbulence;
+use ridgewatch::field::{DomainPoint, turbulence::Turbulence};
 use ridgewatch::field::{EARTH_RADIUS, Geometry, Window};
 use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Interpolation, Precision, Traced, VelocitySource};
 use ridgewatch::source::{Archive, ArchiveSettings, GlobeTurbulence, Metric, SnapshotSource, SyntheticSettings, SyntheticShape};
@@ -15,7 +15,7 @@ fn settings(shape: SyntheticShape, nodes: [usize; 3], k_max: f64, folder: &Path)
     ArchiveSettings { synthetic: Some(synthetic), ..ArchiveSettings::default() }
 }
 
-fn traced(window: &Arc<Window>, seeds: &[[f32; 3]]) -> Traced {
+fn traced(window: &Arc<Window>, seeds: &[DomainPoint]) -> Traced {
     let map = FlowMap {
         direction: Direction::Backward,
         precision: Precision::F64,
@@ -52,11 +52,11 @@ fn compare(found: &[f64], exact: &[f64]) -> (f64, f64) {
 }
 
 /// Seeds in the inner part of a box, far enough from its sides that no path reaches them.
-fn seeds(low: [f64; 3], high: [f64; 3], count: usize) -> Vec<[f32; 3]> {
+fn seeds(low: [f64; 3], high: [f64; 3], count: usize) -> Vec<DomainPoint> {
     (0..count)
         .map(|i| {
             let unit = quasi_random(i);
-            std::array::from_fn(|k| (low[k] + (high[k] - low[k]) * (0.3 + 0.4 * unit[k])) as f32)
+            DomainPoint(std::array::from_fn(|k| (low[k] + (high[k] - low[k]) * (0.3 + 0.4 * unit[k])) as f32))
         })
         .collect()
 }
@@ -74,7 +74,7 @@ fn cells_of_flame_and_ecmwf_give_the_analytic_ftle() {
             let gap = 1e-4;
             let columns: [[f64; 3]; 3] = std::array::from_fn(|k| {
                 let end = |sign: f64| {
-                    let mut x = seed.map(f64::from);
+                    let mut x = seed.0.map(f64::from);
                     x[k] += sign * gap;
                     integrate(x, 4.0, 4.0, 200, &flow)
                 };
@@ -106,7 +106,7 @@ fn cells_of_flame_and_ecmwf_give_the_analytic_ftle() {
 }
 
 /// Log-stretch along the sphere, from central differences of the arrival (p, z) along east, north and up.
-fn globe_stretch(globe: &GlobeTurbulence, seed: [f32; 3], tau: f64) -> f64 {
+fn globe_stretch(globe: &GlobeTurbulence, seed: DomainPoint, tau: f64) -> f64 {
     let flow = |x: [f64; 4], t: f64| {
         let p = unit([x[0], x[1], x[2]]);
         let (v, w) = globe.velocity(p, x[3], t);
@@ -118,13 +118,13 @@ fn globe_stretch(globe: &GlobeTurbulence, seed: [f32; 3], tau: f64) -> f64 {
         let (sin_lon, cos_lon) = (p[1] / cos_lat, p[0] / cos_lat);
         [[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]]
     };
-    let p = direction(f64::from(seed[0]), f64::from(seed[1]));
+    let p = direction(f64::from(seed.0[0]), f64::from(seed.0[1]));
     let [east, north] = basis(p);
     // Metres; a hundred horizontally, ten vertically.
     let offsets = [(east, 0.0, 100.0), (north, 0.0, 100.0), ([0.0; 3], 1.0, 10.0)];
     let arrive = |k: usize, sign: f64| {
         let (direction, up, gap) = offsets[k];
-        let mut x = [p[0], p[1], p[2], f64::from(seed[2]) + sign * up * gap];
+        let mut x = [p[0], p[1], p[2], f64::from(seed.0[2]) + sign * up * gap];
         for i in 0..3 {
             x[i] += sign * direction[i] * gap / EARTH_RADIUS;
         }
@@ -156,13 +156,13 @@ fn metres_over_a_globe_give_the_analytic_ftle() {
     // 1000 hPa to 1 hPa at H = 7 km.
     assert!(grid.axes[2].first().abs() < 1e-9 && (grid.axes[2].last() - 7000.0 * 1000f64.ln()).abs() < 1e-6);
     let globe = GlobeTurbulence::new(settings.synthetic.as_ref().unwrap(), [grid.axes[2].first(), grid.axes[2].last()]);
-    let mut seeds: Vec<[f32; 3]> = (0..150)
+    let mut seeds: Vec<DomainPoint> = (0..150)
         .map(|i| {
             let latitude = (2.0 * (i as f64 + 0.5) / 150.0 - 1.0).asin().to_degrees();
-            [(i as f32 * 137.507_76) % 360.0, latitude as f32, (3000.0 + 20_000.0 * (i as f64 * 0.618_034).fract()) as f32]
+            DomainPoint([(i as f32 * 137.507_76) % 360.0, latitude as f32, (3000.0 + 20_000.0 * (i as f64 * 0.618_034).fract()) as f32])
         })
         .collect();
-    seeds.extend([[12.0, 89.8, 8000.0], [230.0, -89.5, 8000.0]]);
+    seeds.extend([[12.0, 89.8, 8000.0], [230.0, -89.5, 8000.0]].map(DomainPoint));
     let exact: Vec<f64> = seeds.iter().map(|&s| globe_stretch(&globe, s, 4.0)).collect();
     let out = traced(&window(&mut archive), &seeds);
     assert!(out.lifetime_share.iter().all(|&l| l == 1.0));

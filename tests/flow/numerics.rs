@@ -1,9 +1,9 @@
 //! FTLE against closed forms, against the reference integrator, and between settings that must agree.
 
 use crate::kit::flow::{EVERYTHING, stretches, trace};
-use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowError, FlowMap, Integrator, Interpolation, Normalisation, Order, Precision, Steps, Traced, Tracer,
     VelocitySource, cpu_tracer, scalar_tracer, time_resolution, tracer_in_order,
@@ -19,21 +19,21 @@ fn reference(tau: f64) -> FlowMap {
     FlowMap { integrator: Integrator::DormandPrince, ..map(tau, 1, Precision::F64) }
 }
 
-fn run(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Traced {
+fn run(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Traced {
     trace(source, map, t0, seeds, Extras::default())
 }
 
-fn run_tracer(tracer: &dyn Tracer, seeds: &[[f32; 3]]) -> Traced {
+fn run_tracer(tracer: &dyn Tracer, seeds: &[DomainPoint]) -> Traced {
     let mut out = Traced::default();
     tracer.trace(seeds, Extras::default(), &mut out);
     out
 }
 
 /// Midpoints of a lattice over a domain.
-fn lattice(domain: &Domain, counts: [usize; 3]) -> Vec<[f32; 3]> {
+fn lattice(domain: &Domain, counts: [usize; 3]) -> Vec<DomainPoint> {
     let index = |n: usize| [n % counts[0], n / counts[0] % counts[1], n / counts[0] / counts[1]];
     let unit = |n: usize| std::array::from_fn(|k| (index(n)[k] as f32 + 0.5) / counts[k] as f32);
-    (0..counts.iter().product()).map(|n| domain.from_unit(unit(n))).collect()
+    (0..counts.iter().product()).map(|n| domain.from_unit(UnitPoint(unit(n)))).collect()
 }
 
 fn rms_and_max(a: &[f64], b: &[f64]) -> (f64, f64) {
@@ -110,7 +110,7 @@ fn linear_flows_equal_their_closed_forms() {
 fn long_windows_do_not_overflow() {
     // e^1000 is beyond double, e^88 beyond single precision.
     let source = VelocitySource::Analytic(Analytic::Saddle { rate: 10.0 }, square());
-    let seeds = [[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]];
+    let seeds = [[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]].map(DomainPoint);
     // Step times rate 0.1: truncation z^4 / 120 = 8e-7 relative; in single precision half an ulp in every step of 0.1.
     for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::F64, 1e-6)] {
         for s in stretches(&run(&source, &map(100.0, 10_000, precision), 0.0, &seeds)) {
@@ -284,15 +284,15 @@ fn missing_cells_and_edges_stop_particles() {
     let mut u = vec![1.0; grid.nodes()];
     u[2 * 11 + 6] = f32::NAN;
     let source = steady(&grid, &[0.0, 8.0], &u, &vec![0.0; grid.nodes()]);
-    let seeds = [[1.5, 2.5, 0.5], [1.5, 0.5, 0.5], [4.5, 0.5, 0.5], [6.5, 2.5, 0.5]];
+    let seeds = [[1.5, 2.5, 0.5], [1.5, 0.5, 0.5], [4.5, 0.5, 0.5], [6.5, 2.5, 0.5]].map(DomainPoint);
     // The cubic reads one node further in each direction: `coast` is the x of the first stop, `free` that of the second row.
     for (interpolation, coast, free) in [(Interpolation::Linear, 5.0, 9.5), (Interpolation::Cubic, 4.0, 4.0)] {
         let map = FlowMap { boundary: Boundary::Stop, interpolation, ..map(8.0, 80, Precision::F32) };
         let out = trace(&source, &map, 0.0, &seeds, EVERYTHING);
         // A path stops within the step of 0.1 that would cross.
         assert!((out.lifetime_share[0] - (coast - 1.5) / 8.0).abs() < 0.02, "stops before the missing corner: {:?}", out.lifetime_share);
-        assert!((out.arrival[0][0] - coast).abs() < 0.11, "{:?}", out.arrival);
-        assert!((out.arrival[1][0] - free).abs() < 0.11, "{:?}", out.arrival);
+        assert!((out.arrival[0].0[0] - coast).abs() < 0.11, "{:?}", out.arrival);
+        assert!((out.arrival[1].0[0] - free).abs() < 0.11, "{:?}", out.arrival);
         assert_eq!(out.lifetime_share[3], 0.0, "starts in a cell with a missing corner");
         assert!(out.log_stretch.iter().all(|s| s.abs() < 1e-6), "uniform flow does not stretch: {:?}", out.log_stretch);
         assert!((out.jacobian[1][0] - 1.0).abs() < 1e-6 && out.jacobian[1][8] == 1.0);
@@ -309,7 +309,7 @@ fn missing_cells_and_edges_stop_particles() {
 fn particles_that_stop_keep_their_stretch_or_not() {
     // A saddle in a box: a particle at x0 leaves at ln(1 / x0).
     let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, square());
-    let seeds = [[0.5, 0.5, 0.5], [0.01, 0.5, 0.5]];
+    let seeds = [[0.5, 0.5, 0.5], [0.01, 0.5, 0.5]].map(DomainPoint);
     let with = |boundary, normalisation| run(&source, &FlowMap { boundary, normalisation, ..map(2.0, 2000, Precision::F64) }, 0.0, &seeds);
     let stop = with(Boundary::Stop, Normalisation::Tau);
     let lifetime_share = 2f64.ln() / 2.0;
@@ -340,7 +340,7 @@ fn a_periodic_seam_is_a_cell_like_others() {
         let v: Vec<f32> = (0..grid.nodes()).map(|i| 0.5 * phase(i).cos() as f32).collect();
         steady(&grid, &[0.0, 2.0, 6.0], &u, &v)
     };
-    let at = |x: f32| -> Vec<[f32; 3]> { (0..9).map(|i| [x + i as f32 * 0.25, 0.125 * i as f32, 0.5]).collect() };
+    let at = |x: f32| -> Vec<DomainPoint> { (0..9).map(|i| DomainPoint([x + i as f32 * 0.25, 0.125 * i as f32, 0.5])).collect() };
     for interpolation in [Interpolation::Linear, Interpolation::Cubic] {
         let map = FlowMap { boundary: Boundary::Stop, interpolation, ..map(6.0, 60, Precision::F64) };
         let across = run(&make(0), &map, 0.0, &at(30.0));
@@ -358,11 +358,11 @@ fn jacobian_and_arrival_are_those_of_the_flow_map() {
     let window = gridded_gyre(even("x", -0.5, 2.5, 61), even("y", -0.5, 1.5, 121), &[0.0, 0.5, 1.0, 1.5]);
     let map = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, ..map(1.5, 30, Precision::F64) };
     let (x, y, step) = (0.73125f32, 0.375f32, 1.0f32 / 64.0);
-    let seeds = [[x, y, 0.5], [x + step, y, 0.5], [x - step, y, 0.5], [x, y + step, 0.5], [x, y - step, 0.5]];
+    let seeds = [[x, y, 0.5], [x + step, y, 0.5], [x - step, y, 0.5], [x, y + step, 0.5], [x, y - step, 0.5]].map(DomainPoint);
     let out = trace(&VelocitySource::Window(window), &map, 0.0, &seeds, EVERYTHING);
     for i in 0..2 {
         for j in 0..2 {
-            let difference = (out.arrival[1 + 2 * j][i] - out.arrival[2 + 2 * j][i]) / (2.0 * step);
+            let difference = (out.arrival[1 + 2 * j].0[i] - out.arrival[2 + 2 * j].0[i]) / (2.0 * step);
             // step^2 times third derivatives of about 20, over 6.
             assert!((difference - out.jacobian[0][3 * i + j]).abs() < 2e-3, "{i} {j}: {difference} {:?}", out.jacobian[0]);
         }

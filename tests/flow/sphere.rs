@@ -1,7 +1,7 @@
 //! Flows on the sphere and over its poles, with and without levels, whose stretch is known.
 
 use crate::kit::flow::{DAY, EVERYTHING, cross, direction, dot, rotation, stretches, trace};
-use ridgewatch::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot, Window};
+use ridgewatch::field::{Axis, DomainPoint, EARTH_RADIUS, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{Boundary, FlowMap, Integrator, Interpolation, Precision, Traced, VelocitySource};
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -36,23 +36,23 @@ fn globe(cell: f64, levels: usize, tau: f64, flow: impl Fn(f64, f64, f64) -> [f6
 }
 
 /// Seeds evenly spread over the globe and the heights; the last ones lie at and beside the poles.
-fn seeds(count: usize) -> Vec<[f32; 3]> {
-    let mut seeds: Vec<[f32; 3]> = (0..count)
+fn seeds(count: usize) -> Vec<DomainPoint> {
+    let mut seeds: Vec<DomainPoint> = (0..count)
         .map(|i| {
             let latitude = (2.0 * (i as f64 + 0.5) / count as f64 - 1.0).asin().to_degrees();
-            [(i as f32 * 137.507_76) % 360.0, latitude as f32, (TOP * (0.1 + 0.8 * (i as f64 * 0.618_034).fract())) as f32]
+            DomainPoint([(i as f32 * 137.507_76) % 360.0, latitude as f32, (TOP * (0.1 + 0.8 * (i as f64 * 0.618_034).fract())) as f32])
         })
         .collect();
     // From the poles, straight to them and past them, if a quarter of a turn about an axis through 0 and 180 degrees east takes 100 steps.
     for latitude in [90.0f32, 89.99999, 89.999, 89.99, 89.9, 89.7, 89.1, 89.55, 72.0] {
         for aside in [0.0, 1e-5, 1e-3, 0.01, 0.1, 3.0, 80.0] {
-            seeds.extend([[90.0 + aside, latitude, 5000.0], [270.0 - aside, -latitude, 5000.0]]);
+            seeds.extend([[90.0 + aside, latitude, 5000.0], [270.0 - aside, -latitude, 5000.0]].map(DomainPoint));
         }
     }
     seeds
 }
 
-fn traced(source: &VelocitySource, map: &FlowMap, seeds: &[[f32; 3]]) -> Traced {
+fn traced(source: &VelocitySource, map: &FlowMap, seeds: &[DomainPoint]) -> Traced {
     trace(source, map, 0.0, seeds, EVERYTHING)
 }
 
@@ -61,8 +61,8 @@ fn greatest(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Direction of a point.
-fn vector(point: [f32; 3]) -> [f64; 3] {
-    direction(f64::from(point[0]), f64::from(point[1]))
+fn vector(point: DomainPoint) -> [f64; 3] {
+    direction(f64::from(point.0[0]), f64::from(point.0[1]))
 }
 
 /// Tilt of the axis: it lies in the plane of the equator, so that paths cross the poles.
@@ -103,7 +103,7 @@ fn solid_rotation_about_a_tilted_axis_has_ftle_0() {
             let (along, across) = (dot(p, a), cross(a, p));
             let distance = (0..3).map(|i| (across[i] + along * a[i] - q[i]).powi(2)).sum::<f64>().sqrt();
             // Linear interpolation shortens vectors by up to (half a cell)^2 / 2 = 4e-5 of themselves, over a way of pi / 2.
-            assert!(distance < 1e-4 && (arrival[2] - seed[2]).abs() < 1e-2, "{seed:?} {arrival:?} {distance:e}");
+            assert!(distance < 1e-4 && (arrival.0[2] - seed.0[2]).abs() < 1e-2, "{seed:?} {arrival:?} {distance:e}");
         }
     }
 }
@@ -176,9 +176,9 @@ fn rotation_that_turns_faster_above_and_rises_has_a_closed_form() {
         );
         assert!(worst < tolerance, "{worst:e}");
         for (seed, arrival) in seeds.iter().zip(&out.arrival) {
-            let z = middle + e * (f64::from(seed[2]) - middle);
+            let z = middle + e * (f64::from(seed.0[2]) - middle);
             // Heights of 1e4 in f32.
-            assert!((f64::from(arrival[2]) - z).abs() < 0.05, "{seed:?} {arrival:?} {z}");
+            assert!((f64::from(arrival.0[2]) - z).abs() < 0.05, "{seed:?} {arrival:?} {z}");
         }
     }
 }
@@ -191,19 +191,19 @@ fn jacobians_are_those_of_the_coordinates() {
         [u, v, 2e-3 * (z / TOP * TAU).sin()]
     });
     let map = map(tau, 100, Precision::F64, Interpolation::Cubic);
-    let (step, seed) = ([0.5f32, 0.5, 64.0], [50.0f32, 20.0, 8000.0]);
+    let (step, seed) = ([0.5f32, 0.5, 64.0], DomainPoint([50.0f32, 20.0, 8000.0]));
     let mut seeds = vec![seed];
     for axis in 0..3 {
         for sign in [1.0, -1.0] {
             let mut moved = seed;
-            moved[axis] += sign * step[axis];
+            moved.0[axis] += sign * step[axis];
             seeds.push(moved);
         }
     }
     let out = traced(&source, &map, &seeds);
     for i in 0..3 {
         for j in 0..3 {
-            let difference = (out.arrival[1 + 2 * j][i] - out.arrival[2 + 2 * j][i]) / (2.0 * step[j]);
+            let difference = (out.arrival[1 + 2 * j].0[i] - out.arrival[2 + 2 * j].0[i]) / (2.0 * step[j]);
             let size = step[i] / step[j];
             // Arrivals in f32 (1e-5 degrees, 5e-4 m over steps), and third derivatives of a flow map of a few tenths a radian.
             assert!((difference - out.jacobian[0][3 * i + j]).abs() < 1e-3 * size.max(1.0), "{i} {j}: {difference} {:?}", out.jacobian[0]);
@@ -216,7 +216,11 @@ fn missing_levels_stop_particles() {
     // Sinking into a level without velocity, as into a mountain.
     let tau = 10.0 * DAY;
     let source = globe(5.0, 5, tau, |_, _, z| [0.0, 0.0, if z < 1.0 { f64::NAN } else { -0.01 }]);
-    let out = traced(&source, &map(tau, 100, Precision::F32, Interpolation::Linear), &[[0.0, 0.0, 6000.0], [0.0, 0.0, 19_000.0]]);
+    let out = traced(
+        &source,
+        &map(tau, 100, Precision::F32, Interpolation::Linear),
+        &[DomainPoint([0.0, 0.0, 6000.0]), DomainPoint([0.0, 0.0, 19_000.0])],
+    );
     // The lowest cell ends at 2500 m.
     assert!(out.lifetime_share[0] > 0.3 && out.lifetime_share[0] < 0.5 && out.lifetime_share[1] == 1.0, "{:?}", out.lifetime_share);
 }
@@ -229,8 +233,9 @@ fn solid_rotation_of_the_sphere_does_not_stretch() {
         let [u, v] = rotation(TAU / 2.0 / tau, tilt, lon, lat);
         [u, v, 0.0]
     });
-    let seeds: Vec<[f32; 3]> =
-        (0..400).map(|i| [(i as f32 * 137.507_76) % 360.0, ((i as f32 + 0.5) / 200.0 - 1.0).asin().to_degrees(), 0.5]).collect();
+    let seeds: Vec<DomainPoint> = (0..400)
+        .map(|i| DomainPoint([(i as f32 * 137.507_76) % 360.0, ((i as f32 + 0.5) / 200.0 - 1.0).asin().to_degrees(), 0.5]))
+        .collect();
     for (precision, interpolation, tolerance) in [
         // Linear gradients on cells of half a degree are off by up to half a cell (4e-3) of the rate times pi, with changing sign.
         (Precision::F64, Interpolation::Linear, 5e-3),
@@ -265,8 +270,8 @@ fn zonal_shear_on_the_sphere_has_a_closed_form() {
     // north) at seed and arrival J = [[1, g], [0, 1]] with g = k tau cos(lat)^2: a shear.
     let (speed, tau) = (40.0, 10.0 * DAY);
     let source = globe(0.5, 1, tau, |_, lat, _| [speed * lat.cos() * lat.sin(), 0.0, 0.0]);
-    let seeds: Vec<[f32; 3]> = (0..160).map(|i| [i as f32 * 2.25, i as f32 - 80.0, 0.5]).collect();
-    let rate = |s: &[f32; 3]| speed / EARTH_RADIUS * f64::from(s[1]).to_radians().cos().powi(2);
+    let seeds: Vec<DomainPoint> = (0..160).map(|i| DomainPoint([i as f32 * 2.25, i as f32 - 80.0, 0.5])).collect();
+    let rate = |s: &DomainPoint| speed / EARTH_RADIUS * f64::from(s.0[1]).to_radians().cos().powi(2);
     let expected: Vec<f64> = seeds.iter().map(|s| sheared(rate(s) * tau, 1.0)).collect();
     for (integrator, precision) in
         [(Integrator::Tangent, Precision::F32), (Integrator::Tangent, Precision::F64), (Integrator::Differences, Precision::F64)]

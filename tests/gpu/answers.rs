@@ -6,7 +6,7 @@ use ridgewatch::backend::cuda::{
     LookAhead, Outputs, SnapshotStore, Tuning,
 };
 use ridgewatch::backend::{Device, QueryRouter, Routing, Tally, audit, keeps_label, residuals, stratified_points};
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
@@ -275,7 +275,7 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
         assert!(first.len() < keep && (first.len() > keep / 4 || first.len() as u64 >= tally.traced), "{} for {keep}", first.len());
         // They lie where nothing is trusted, and hold what the CPU traces there.
         assert!(first.points.iter().all(|&p| !stage.gate.trusts(p)));
-        let points: Vec<[f32; 3]> = first.points.iter().map(|&p| stage.domain().from_unit(p)).collect();
+        let points: Vec<DomainPoint> = first.points.iter().map(|&p| stage.domain().from_unit(p)).collect();
         let mut exact = ridgewatch::flow::Traced::default();
         Trace::trace(&stage.host, &points, Extras::default(), &mut exact).unwrap();
         let mut errors: Vec<f32> = exact.log_stretch.iter().zip(&first.log_stretch).map(|(a, b)| (a - b).abs()).collect();
@@ -292,17 +292,18 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
 }
 
 /// Keeps what it is told to learn from.
-struct Heard(RefCell<Vec<([f32; 3], f32, [f32; 3])>>);
+struct Heard(RefCell<Vec<(DomainPoint, f32, DomainPoint)>>);
 
 impl DeviceLearns for Heard {
     unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
-        let (mut at, mut values, mut arrivals) = (vec![[0.0_f32; 3]; count], vec![0.0_f32; count], vec![[0.0_f32; 3]; count]);
+        let (mut at, mut values, mut arrivals) =
+            (vec![DomainPoint::default(); count], vec![0.0_f32; count], vec![DomainPoint::default(); count]);
         gpu().synchronize()?;
         // SAFETY: the caller's; the work that wrote them is done.
         unsafe {
-            cudarc::driver::result::memcpy_dtoh_sync(at.as_flattened_mut(), points).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(bytemuck::cast_slice_mut::<_, f32>(&mut at), points).unwrap();
             cudarc::driver::result::memcpy_dtoh_sync(&mut values, traced.log_stretch).unwrap();
-            cudarc::driver::result::memcpy_dtoh_sync(arrivals.as_flattened_mut(), traced.arrival).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(bytemuck::cast_slice_mut::<_, f32>(&mut arrivals), traced.arrival).unwrap();
         }
         self.0.borrow_mut().extend(at.into_iter().zip(values).zip(arrivals).map(|((at, value), arrival)| (at, value, arrival)));
         Ok(())
@@ -323,10 +324,9 @@ fn what_stays_on_the_device_is_what_was_traced() {
     assert_eq!(heard.len() as u64, tally.traced);
     // As traced on the host: in the unit coordinates of labels, which do not end at the domain's edges.
     let domain = stage.domain();
-    let arrival = |p: [f32; 3]| std::array::from_fn(|k| ((f64::from(p[k]) - domain.min[k]) / domain.extent()[k]) as f32);
-    let bits = |point: [f32; 3], value: f32, arrival: [f32; 3]| (point.map(f32::to_bits), value.to_bits(), arrival.map(f32::to_bits));
+    let bits = |point: UnitPoint, value: f32, arrival: UnitPoint| (point.0.map(f32::to_bits), value.to_bits(), arrival.0.map(f32::to_bits));
     let mut held_back: Vec<_> = (heard.iter().filter(|(point, ..)| keeps_label(*point, 3)))
-        .map(|&(point, value, there)| bits(domain.to_unit(point), value, arrival(there)))
+        .map(|&(point, value, there)| bits(domain.to_unit(point), value, domain.to_unit_unclamped(there)))
         .collect();
     let mut back: Vec<_> = (labels.points.iter().zip(&labels.log_stretch).zip(&labels.arrival))
         .map(|((&point, &value), &arrival)| bits(point, value, arrival))

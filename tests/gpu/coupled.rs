@@ -22,7 +22,7 @@ fn nodes() -> Nodes {
     let shape = [33, 17, 17];
     let value = |index: usize| {
         let unit = Nodes::unit(shape, index);
-        let (value, _) = waves([1.7 * unit[0], unit[1].max(0.31), unit[2]]);
+        let (value, _) = waves([1.7 * unit.0[0], unit.0[1].max(0.31), unit.0[2]]);
         1.05 * value - 0.02
     };
     Nodes::new(shape, Arc::new((0..shape.iter().product()).map(value).collect()))

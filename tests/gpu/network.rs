@@ -8,7 +8,7 @@ use burn::backend::Flex;
 use burn::module::Param;
 use burn::tensor::{Tensor, TensorData};
 use ridgewatch::backend::cuda::{CudaTraining, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
     Architecture, Encoding, Input, Loss, Model, NetworkSettings, Objective, PlannedStep, Row, Target, row, stock_step,
@@ -138,9 +138,9 @@ pub(super) fn stored(training: &DeviceTraining, like: &Model) -> Model {
     model
 }
 
-pub(super) fn predict(network: &dyn DevicePredict, points: &[[f32; 3]]) -> Vec<f32> {
+pub(super) fn predict(network: &dyn DevicePredict, points: &[UnitPoint]) -> Vec<f32> {
     let gpu = gpu();
-    let flat = gpu.upload("points", points).unwrap();
+    let flat = gpu.upload::<[f32; 3]>("points", bytemuck::cast_slice(points)).unwrap();
     let out = gpu.upload("values", &vec![f32::NAN; points.len()]).unwrap();
     // SAFETY: both buffers hold as many entries as there are points.
     unsafe { network.predict(flat.address(), points.len(), out.address()) }.unwrap();
@@ -150,8 +150,8 @@ pub(super) fn predict(network: &dyn DevicePredict, points: &[[f32; 3]]) -> Vec<f
 }
 
 /// What the kernels take a point of three numbers for: a time stands where the network is shown no axis.
-fn row_of(shape: &Architecture, point: [f32; 3]) -> Row {
-    let free = (0..3).find(|axis| !shape.space().contains(axis)).map_or(0.0, |axis| point[axis]);
+fn row_of(shape: &Architecture, point: UnitPoint) -> Row {
+    let free = (0..3).find(|axis| !shape.space().contains(axis)).map_or(0.0, |axis| point.0[axis]);
     row(point, [free; 2])
 }
 
@@ -169,10 +169,10 @@ fn predictions_are_the_references() {
     for (case, (model, objective, _)) in prepared() {
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         // Not a multiple of any tile, with corners, and points outside, which are moved to the edge.
-        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), if small() || case.settings.hidden_layers > 6 { 203 } else { 5003 });
-        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0], [-0.5, 0.3, 2.0]]);
+        let mut points = fresh_unit(0.0, 1.0, if small() || case.settings.hidden_layers > 6 { 203 } else { 5003 });
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0], [-0.5, 0.3, 2.0]].map(UnitPoint));
         let found = predict(&network, &points);
-        let inside = |p: &[f32; 3]| p.map(|x| x.clamp(0.0, 1.0));
+        let inside = |p: &UnitPoint| UnitPoint(p.0.map(|x| x.clamp(0.0, 1.0)));
         let rows: Vec<Row> = points.iter().map(|p| row_of(&model.shape, inside(p))).collect();
         let (halves, exact) = (Reference::in_halves(&model), Reference::new(&model));
         let values = |outputs: Vec<f64>| outputs.into_iter().map(|output| read(&objective, output)).collect::<Vec<f64>>();
@@ -218,7 +218,7 @@ fn a_network_that_is_no_number_predicts_none() {
         let mut layers = model.layers();
         layers[0] = f32::NAN;
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &layers).unwrap();
-        let found = predict(&network, &fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 203));
+        let found = predict(&network, &fresh_unit(0.0, 1.0, 203));
         assert!(found.iter().all(|value| value.is_nan()), "{}: {found:?}", case.name);
     }
 }
@@ -342,7 +342,7 @@ fn a_table_below_adds_up() {
     let table = Table::trace(&tracer, [20, 12, 12]).unwrap();
     let base = DeviceTable::upload(&gpu, &domain(&source), &table).unwrap();
     let (model, objective, _) = prepare(&cases()[1]);
-    let points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 4001);
+    let points = fresh_unit(0.0, 1.0, 4001);
     let network = DeviceNetwork::upload(&gpu, &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
     let alone = predict(&network, &points);
     let sum = predict(&network.above(Some((&base, 0.7))), &points);
@@ -373,7 +373,7 @@ fn held_out_and_broken_samples_are_not_learned_from() {
     }
     samples.log_stretch[5] = f32::NAN;
     samples.log_stretch[6] = f32::INFINITY;
-    samples.points[7][1] = f32::NAN;
+    samples.points[7].0[1] = f32::NAN;
     let mut device = training(&model, &objective);
     let pool = device.upload(&samples, None).unwrap();
     let drawn = |hold_out| PlannedStep { drawn: Some((1, 0)), hold_out, ..step(5000, 1e-3) };
@@ -403,7 +403,8 @@ fn times_stand_where_no_axis_does() {
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         let free = (0..3).find(|axis| !case.axes.contains(axis)).unwrap();
         let points = uniform_points(4, 700);
-        let brought: Vec<[f32; 3]> = points.iter().map(|&point| std::array::from_fn(|k| if k == free { 0.3 } else { point[k] })).collect();
+        let brought: Vec<UnitPoint> =
+            points.iter().map(|point| UnitPoint(std::array::from_fn(|k| if k == free { 0.3 } else { point.0[k] }))).collect();
         let times = if case.settings.inputs == [Input::Start] { [0.3, 0.9] } else { [0.9, 0.3] };
         assert_eq!(predict(&network.above(None).at(times), &points), predict(&network, &brought), "{}", case.name);
     }
@@ -420,11 +421,14 @@ fn a_ring_keeps_the_newest() {
     let mut written = 0;
     for (seed, count) in [(1, 300), (2, 500), (3, 300), (4, 1000), (5, 1)] {
         let samples = labels(count, seed);
-        let (points, values) = (gpu().upload("points", &samples.points).unwrap(), gpu().upload("values", &samples.log_stretch).unwrap());
+        let (points, values) = (
+            gpu().upload::<[f32; 3]>("points", bytemuck::cast_slice(&samples.points)).unwrap(),
+            gpu().upload("values", &samples.log_stretch).unwrap(),
+        );
         // SAFETY: both buffers hold `count` entries and are freed in the order of the work stream.
         unsafe { device.append(&mut buffer, &unit, points.address(), values.address(), count, None) }.unwrap();
         for (p, s) in samples.points.iter().zip(&samples.log_stretch) {
-            expected[written % 1000] = [p[0], p[1], p[2], (s - objective.scale.mean[0]) / objective.scale.deviation[0]];
+            expected[written % 1000] = [p.0[0], p.0[1], p.0[2], (s - objective.scale.mean[0]) / objective.scale.deviation[0]];
             written += 1;
         }
         assert_eq!(buffer.len(), written.min(1000));
@@ -520,11 +524,11 @@ fn drawn_points_fill_the_domain() {
     device.draw_points(&domain, 5, 1 << 40, &mut buffer).unwrap();
     let mut points = vec![[0.0; 3]; 1 << 16];
     buffer.read(&mut points).unwrap();
-    assert!(points.iter().all(|&p| domain.contains(p)));
+    assert!(points.iter().all(|&p| domain.contains(DomainPoint(p))));
     for axis in 0..3 {
         // Sixteen even parts; six standard deviations of their counts.
         let mut counts = [0_i32; 16];
-        points.iter().for_each(|&p| counts[(domain.to_unit(p)[axis] * 16.0).min(15.0) as usize] += 1);
+        points.iter().for_each(|&p| counts[(domain.to_unit(DomainPoint(p)).0[axis] * 16.0).min(15.0) as usize] += 1);
         assert!(counts.iter().all(|c| (c - 4096).abs() < 6 * 64), "{counts:?}");
     }
 }

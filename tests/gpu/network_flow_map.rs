@@ -10,7 +10,7 @@ use crate::kit::scene;
 use nalgebra::DMatrix;
 use ridgewatch::backend::Device;
 use ridgewatch::backend::cuda::{DeviceNetwork, GpuSettings};
-use ridgewatch::field::Domain;
+use ridgewatch::field::UnitPoint;
 use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Objective, Target, row};
 
@@ -65,8 +65,8 @@ fn flow_maps_are_differentiated_as_the_reference_s() {
         let model = settled(&model);
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         // Not a multiple of any tile, with corners.
-        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 3003);
-        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]]);
+        let mut points = fresh_unit(0.0, 1.0, 3003);
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]].map(UnitPoint));
         let times = [0.3, 0.85];
         let found = predict(&network.above(None).at(times), &points);
         for (name, reference) in [("in halves", Reference::in_halves(&model)), ("exact", Reference::new(&model))] {

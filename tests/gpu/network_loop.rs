@@ -207,7 +207,7 @@ fn dealt_out(found: &[Frame], expected: &[Frame]) -> (f64, usize, usize) {
     let (difference, pixels) = difference_over_noise(&frames, &dealt);
     let larger = (0..DEALS as u64).filter(|deal| {
         let random = uniform_points(*deal, dealt.len());
-        (1..dealt.len()).for_each(|last| dealt.swap(last, ((random[last][0] * (last + 1) as f32) as usize).min(last)));
+        (1..dealt.len()).for_each(|last| dealt.swap(last, ((random[last].0[0] * (last + 1) as f32) as usize).min(last)));
         difference_over_noise(&frames, &dealt).0 >= difference
     });
     let larger = larger.count();

@@ -10,6 +10,7 @@ use burn::module::Param;
 use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceNetwork, Tuning, is_fused};
+use ridgewatch::field::UnitPoint;
 use ridgewatch::surrogate::network::{Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, row};
 use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, Samples};
 use std::ops::Range;
@@ -200,8 +201,8 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
         Some(Input::Duration) if !axes.contains(&k) => Some(times[1]),
         _ => None,
     };
-    let place = |(point, times): (&[f32; 3], &[f32; 2])| std::array::from_fn(|k| of_time(k, times).unwrap_or(point[k]));
-    let points: Vec<[f32; 3]> = held_out.points.iter().zip(&held_out.times).map(place).collect();
+    let place = |(point, times): (&UnitPoint, &[f32; 2])| UnitPoint(std::array::from_fn(|k| of_time(k, times).unwrap_or(point.0[k])));
+    let points: Vec<UnitPoint> = held_out.points.iter().zip(&held_out.times).map(place).collect();
     let frozen = predict(&device.frozen().unwrap(), &points);
     let back = device.average().unwrap();
     let again = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &back.tables, &back.layers).unwrap();

@@ -3,8 +3,8 @@
 use crate::scenes::{gpu, opened, store, turbulence};
 use ridgewatch::backend::cuda::driver_error;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, GpuSettings, LookAhead, TraceAll, Tuning};
-use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{Domain, DomainPoint};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
@@ -24,9 +24,9 @@ pub fn waves(p: [f32; 3]) -> (f32, bool) {
 pub struct OnHost;
 
 impl LogStretch for OnHost {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         for (i, p) in points.iter().enumerate() {
-            (log_stretch[i], traced[i]) = waves(*p);
+            (log_stretch[i], traced[i]) = waves(p.0);
         }
     }
 }
@@ -146,7 +146,7 @@ fn map(tau: f64, steps: usize, boundary: Boundary) -> FlowMap {
 struct ByCpu(Box<dyn Tracer>);
 
 impl LogStretch for ByCpu {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         let mut out = ridgewatch::flow::Traced::default();
         self.0.trace(points, Extras::default(), &mut out);
         log_stretch.copy_from_slice(&out.log_stretch);

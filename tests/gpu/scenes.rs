@@ -3,9 +3,9 @@
 use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, CudaTraining, Gpu, GpuSettings, OnGpu, SnapshotStore, Storage, Tuning};
 use ridgewatch::backend::{CudaDevice, Device, WhenLost};
-use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
@@ -70,32 +70,37 @@ pub fn domain(source: &VelocitySource) -> Domain {
 }
 
 /// Other points in every run.
-pub fn fresh(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+pub fn fresh(domain: &Domain, count: usize) -> Vec<DomainPoint> {
     let state = RandomState::new();
     let uniform = |i: usize| {
         let mut hasher = state.build_hasher();
         hasher.write_usize(i);
         (hasher.finish() >> 40) as f32 / (1u32 << 24) as f32
     };
-    (0..count).map(|i| domain.from_unit([uniform(3 * i), uniform(3 * i + 1), uniform(3 * i + 2)])).collect()
+    (0..count).map(|i| domain.from_unit(UnitPoint([uniform(3 * i), uniform(3 * i + 1), uniform(3 * i + 2)]))).collect()
+}
+
+/// Other unit points in every run, between these bounds along each axis.
+pub fn fresh_unit(low: f64, high: f64, count: usize) -> Vec<UnitPoint> {
+    fresh(&Domain::cuboid([low; 3], [high; 3]), count).into_iter().map(|p| UnitPoint(p.0)).collect()
 }
 
 const EVERYTHING: Extras = Extras { arrival: true, jacobian: true };
 
-pub fn on_cpu(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Traced {
+pub fn on_cpu(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Traced {
     let mut out = Traced::default();
     cpu_tracer(source.clone(), map, t0).unwrap().trace(seeds, EVERYTHING, &mut out).unwrap();
     out
 }
 
 /// Poisons what comes back, so that an entry that nothing wrote shows.
-pub fn on_gpu(source: &VelocitySource, map: &FlowMap, t0: f64, tuning: Tuning, seeds: &[[f32; 3]]) -> Traced {
+pub fn on_gpu(source: &VelocitySource, map: &FlowMap, t0: f64, tuning: Tuning, seeds: &[DomainPoint]) -> Traced {
     let n = seeds.len();
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
         lifetime_share: vec![f32::NAN; n],
-        arrival: vec![[f32::NAN; 3]; n],
+        arrival: vec![DomainPoint([f32::NAN; 3]); n],
         jacobian: vec![[f32::NAN; 9]; n],
     };
     let tracer = CudaTracer::new(store(), &gpu(), source.clone(), map, t0, tuning).unwrap();

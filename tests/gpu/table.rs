@@ -47,7 +47,7 @@ fn check(source: &VelocitySource, nodes: [usize; 3]) {
     let file = tempfile::NamedTempFile::new().unwrap();
     there.save(file.path()).unwrap();
     host.load(file.path()).unwrap();
-    let points = fresh(&ridgewatch::field::Domain::cuboid([-0.1; 3], [1.1; 3]), 30_001);
+    let points = fresh_unit(-0.1, 1.1, 30_001);
     let (mut found, mut here) = (vec![f32::NAN; points.len()], vec![f32::NAN; points.len()]);
     assert!(there.table().unwrap().device().is_ok());
     there.predict(&points, &mut found).unwrap();
@@ -77,7 +77,7 @@ fn a_table_of_a_run_stays_on_the_device() {
     let tracer = |t0: f64| CudaTracer::new(store(), &gpu, source.clone(), &map, t0, Tuning::default()).unwrap();
     let domain = domain(&source);
     let mut table = on_device(&tracer(0.0), nodes);
-    let points = fresh(&ridgewatch::field::Domain::cuboid([0.0; 3], [1.0; 3]), 30_001);
+    let points = fresh_unit(0.0, 1.0, 30_001);
     for t0 in [0.0, 1.0] {
         if t0 > 0.0 {
             let frozen = table.freeze().unwrap();

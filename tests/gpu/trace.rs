@@ -2,8 +2,8 @@
 
 use super::scenes::*;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceTracer, Outputs, Storage, Tuning};
-use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{Domain, DomainPoint};
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource};
 
 /// Paths that the CPU and the kernel judge differently at an edge, as a share: rounding decides them.
@@ -23,7 +23,7 @@ fn most(exact: &Traced, found: &Traced, same: &[usize]) -> [f64; 3] {
     };
     [
         percentile(&|i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).abs()),
-        percentile(&|i| apart(&exact.arrival[i], &found.arrival[i]).into()),
+        percentile(&|i| apart(&exact.arrival[i].0, &found.arrival[i].0).into()),
         percentile(&|i| apart(&exact.jacobian[i], &found.jacobian[i]).into()),
     ]
 }
@@ -41,7 +41,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
         let largest = exact.jacobian[i].iter().fold(1f32, |m, x| m.max(x.abs()));
         let close = |a: f32, b: f32, size: f32| (a - b).abs() <= 1e-5f32.max(tolerance as f32) * size;
-        let arrived = (0..3).all(|k| close(exact.arrival[i][k], double.arrival[i][k], exact.arrival[i][k].abs().max(1.0)));
+        let arrived = (0..3).all(|k| close(exact.arrival[i].0[k], double.arrival[i].0[k], exact.arrival[i].0[k].abs().max(1.0)));
         let jacobian = (0..9).all(|k| close(exact.jacobian[i][k], double.jacobian[i][k], largest));
         !((a - b).abs() < tolerance * a.abs().max(1.0) && arrived && jacobian)
     });
@@ -89,7 +89,7 @@ fn seeds_with_starts_of_their_own() {
         let tracer = DeviceTracer::with_starts(&gpu(), &flow, &plane, &map, 40).unwrap();
         let found = traced_there(&tracer, &seeds);
         for (seed, found) in seeds.iter().zip(&found) {
-            let exact = on_cpu(&gyre([0.0, 0.0], [2.0, 1.0]), &super::scenes::map(10.0, 40), f64::from(seed[2]), &[*seed]);
+            let exact = on_cpu(&gyre([0.0, 0.0], [2.0, 1.0]), &super::scenes::map(10.0, 40), f64::from(seed.0[2]), &[*seed]);
             let exact = exact.log_stretch_f64[0];
             assert!((found - exact).abs() < tolerance * exact.abs().max(1.0), "{precision:?} {seed:?}: {found} for {exact}");
         }
@@ -98,8 +98,8 @@ fn seeds_with_starts_of_their_own() {
     assert!(DeviceTracer::with_starts(&gpu(), &saddle, &plane, &map(10.0, 40), 40).is_err());
 }
 
-fn traced_there(tracer: &DeviceTracer, seeds: &[[f32; 3]]) -> Vec<f64> {
-    let points = gpu().upload("seeds", seeds).unwrap();
+fn traced_there(tracer: &DeviceTracer, seeds: &[DomainPoint]) -> Vec<f64> {
+    let points = gpu().upload::<[f32; 3]>("seeds", bytemuck::cast_slice(seeds)).unwrap();
     let single = gpu().upload("values", &vec![f32::NAN; seeds.len()]).unwrap();
     let double = gpu().upload("values", &vec![f64::NAN; seeds.len()]).unwrap();
     let out = Outputs { log_stretch: single.address(), log_stretch_f64: double.address(), ..Outputs::default() };
@@ -223,11 +223,11 @@ fn more_than_2_to_the_24_seeds_at_once() {
     let source = turbulence([24, 16, 16], 4);
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 6) };
     let some = fresh(&domain(&source), 20_011);
-    let seeds: Vec<[f32; 3]> = some.iter().copied().cycle().take((1 << 24) + 4_099).collect();
+    let seeds: Vec<DomainPoint> = some.iter().copied().cycle().take((1 << 24) + 4_099).collect();
     let apart = on_gpu(&source, &map, 0.0, Tuning::default(), &some);
     let gpu = gpu();
     let tracer = CudaTracer::new(store(), &gpu, source, &map, 0.0, Tuning::default()).unwrap();
-    let points = gpu.upload("seeds", &seeds).unwrap();
+    let points = gpu.upload::<[f32; 3]>("seeds", bytemuck::cast_slice(&seeds)).unwrap();
     let values = gpu.upload("values", &vec![f32::NAN; seeds.len()]).unwrap();
     let out = Outputs { log_stretch: values.address(), ..Outputs::default() };
     // SAFETY: both buffers hold as many entries, and reading waits for the stream.

@@ -3,7 +3,7 @@
 use super::scenes::*;
 use ridgewatch::backend::BackendError;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceError, GpuSettings, SnapshotStore, Storage, Tuning};
-use ridgewatch::field::Window;
+use ridgewatch::field::{DomainPoint, Window};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Steps, Traced, VelocitySource};
 use ridgewatch::surrogate::Trace;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ fn a_slide_brings_only_what_is_new() {
         window.push(snapshot(&grid, f64::from(time), 0.5, false)).unwrap();
     }
     let mut taken = None;
-    let mut before: Option<(CudaTracer, Traced, Vec<[f32; 3]>)> = None;
+    let mut before: Option<(CudaTracer, Traced, Vec<DomainPoint>)> = None;
     for slide in 0..12u32 {
         let source = VelocitySource::Window(Arc::new(window.clone()));
         let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, f64::from(slide), Tuning::default()).unwrap();

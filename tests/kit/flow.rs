@@ -1,6 +1,6 @@
 //! Flows whose stretch is known, windows, and how they are traced.
 
-use ridgewatch::field::{EARTH_RADIUS, Window};
+use ridgewatch::field::{DomainPoint, EARTH_RADIUS, Window};
 use ridgewatch::flow::{Extras, FlowMap, Traced, VelocitySource, cpu_tracer};
 use ridgewatch::source::{Archive, SnapshotSource};
 use std::sync::Arc;
@@ -10,7 +10,7 @@ pub const DAY: f64 = 86_400.0;
 /// Arrivals and Jacobians besides the stretch.
 pub const EVERYTHING: Extras = Extras { arrival: true, jacobian: true };
 
-pub fn trace(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]], extras: Extras) -> Traced {
+pub fn trace(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint], extras: Extras) -> Traced {
     let mut out = Traced::default();
     cpu_tracer(source.clone(), map, t0).unwrap().trace(seeds, extras, &mut out);
     out

@@ -5,7 +5,7 @@
 pub mod reference;
 
 use rayon::prelude::*;
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Extras, Traced, Tracer};
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
 use ridgewatch::surrogate::{Predict, Samples};
@@ -40,7 +40,7 @@ fn rate(t: f64, s: &[f64; 6]) -> [f64; 6] {
     [u, v, ux * s[2] + uy * s[4], ux * s[3] + uy * s[5], vx * s[2] + vy * s[4], vx * s[3] + vy * s[5]]
 }
 
-fn advect(start: f64, tau: f64, steps: usize, point: [f32; 3]) -> [f64; 6] {
+fn advect(start: f64, tau: f64, steps: usize, DomainPoint(point): DomainPoint) -> [f64; 6] {
     let mut s = [f64::from(point[0]), f64::from(point[1]), 1.0, 0.0, 0.0, 1.0];
     let h = tau / steps as f64;
     let along = |s: &[f64; 6], k: &[f64; 6], h: f64| -> [f64; 6] { std::array::from_fn(|i| s[i] + h * k[i]) };
@@ -68,7 +68,7 @@ impl Tracer for DoubleGyre {
     fn steps(&self) -> usize {
         self.steps
     }
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) {
         let states: Vec<[f64; 6]> = seeds.par_iter().map(|&p| advect(self.start, self.tau, self.steps, p)).collect();
         out.log_stretch = states
             .iter()
@@ -79,36 +79,38 @@ impl Tracer for DoubleGyre {
             })
             .collect();
         out.lifetime_share = vec![1.0; seeds.len()];
-        out.arrival =
-            if extras.arrival { states.iter().zip(seeds).map(|(s, p)| [s[0] as f32, s[1] as f32, p[2]]).collect() } else { Vec::new() };
+        out.arrival = if extras.arrival {
+            states.iter().zip(seeds).map(|(s, p)| DomainPoint([s[0] as f32, s[1] as f32, p.0[2]])).collect()
+        } else {
+            Vec::new()
+        };
         let matrix = |s: &[f64; 6]| [s[2] as f32, s[3] as f32, 0.0, s[4] as f32, s[5] as f32, 0.0, 0.0, 0.0, 1.0];
         out.jacobian = if extras.jacobian { states.iter().map(matrix).collect() } else { Vec::new() };
     }
 }
 
 /// Uniform points of the unit domain, from a seed.
-pub fn uniform_points(seed: u64, count: usize) -> Vec<[f32; 3]> {
+pub fn uniform_points(seed: u64, count: usize) -> Vec<UnitPoint> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut random = || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 40) as f32 / (1_u64 << 24) as f32
     };
-    (0..count).map(|_| std::array::from_fn(|_| random())).collect()
+    (0..count).map(|_| UnitPoint(std::array::from_fn(|_| random()))).collect()
 }
 
 /// Traced samples at unit points, flow-map labels included, in unit coordinates.
-pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> Samples {
+pub fn traced(tracer: &dyn Tracer, points: Vec<UnitPoint>, flow_map: bool) -> Samples {
     let domain = tracer.domain();
-    let seeds: Vec<[f32; 3]> = points.iter().map(|&p| domain.from_unit(p)).collect();
+    let seeds: Vec<DomainPoint> = points.iter().map(|&p| domain.from_unit(p)).collect();
     let mut out = Traced::default();
     tracer.trace(&seeds, Extras { arrival: flow_map, jacobian: flow_map }, &mut out);
     let extent = domain.extent();
-    let unit = |p: &[f32; 3]| std::array::from_fn(|k| ((f64::from(p[k]) - domain.min[k]) / extent[k]) as f32);
     let scaled = |j: &[f32; 9]| std::array::from_fn(|i| j[i] * (extent[i % 3] / extent[i / 3]) as f32);
     Samples {
         points,
         log_stretch: out.log_stretch,
-        arrival: out.arrival.iter().map(unit).collect(),
+        arrival: out.arrival.iter().map(|&p| domain.to_unit_unclamped(p)).collect(),
         jacobian: out.jacobian.iter().map(scaled).collect(),
         times: Vec::new(),
     }

@@ -2,6 +2,7 @@
 
 use super::uniform_points;
 use rayon::prelude::*;
+use ridgewatch::field::UnitPoint;
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{Architecture, Encoding, Level, Loss, Model, Objective, Row, Target, row};
 
@@ -152,7 +153,7 @@ impl<'a> Reference<'a> {
                 let axes = self.shape.space();
                 for (o, &axis) in axes.iter().enumerate() {
                     let deviation = f64::from(objective.scale.deviation[o]);
-                    let moved = f64::from(samples.arrival[i][axis] - samples.points[i][axis]);
+                    let moved = f64::from(samples.arrival[i].0[axis] - samples.points[i].0[axis]);
                     let target = (moved - f64::from(objective.scale.mean[o])) / deviation;
                     loss += (rows[0][o] - target).powi(2) / (count * outputs as f64);
                     for (a, &along) in axes.iter().enumerate() {
@@ -302,14 +303,14 @@ pub fn target(objective: &Objective, log_stretch: f32) -> f64 {
 /// Smooth labels, of no real flow: gradients do not depend on that.
 pub fn labels(count: usize, seed: u64) -> Samples {
     let points = uniform_points(seed, count);
-    let value = |p: &[f32; 3]| 1.5 * (4.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2] - 0.4;
-    let arrival = |p: &[f32; 3]| [p[0] + 0.2 * (3.0 * p[1]).sin(), p[1] - 0.3 * p[0] * p[2], p[2] + 0.1 * p[0]];
-    let jacobian = |p: &[f32; 3]| [1.0, 0.6 * (3.0 * p[1]).cos(), 0.0, -0.3 * p[2], 1.0, -0.3 * p[0], 0.1, 0.0, 1.0];
+    let value = |UnitPoint(p): &UnitPoint| 1.5 * (4.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2] - 0.4;
+    let arrival = |UnitPoint(p): &UnitPoint| UnitPoint([p[0] + 0.2 * (3.0 * p[1]).sin(), p[1] - 0.3 * p[0] * p[2], p[2] + 0.1 * p[0]]);
+    let jacobian = |UnitPoint(p): &UnitPoint| [1.0, 0.6 * (3.0 * p[1]).cos(), 0.0, -0.3 * p[2], 1.0, -0.3 * p[0], 0.1, 0.0, 1.0];
     Samples {
         log_stretch: points.iter().map(value).collect(),
         arrival: points.iter().map(arrival).collect(),
         jacobian: points.iter().map(jacobian).collect(),
-        times: uniform_points(seed + 1000, count).into_iter().map(|[start, duration, _]| [start, duration]).collect(),
+        times: uniform_points(seed + 1000, count).into_iter().map(|UnitPoint([start, duration, _])| [start, duration]).collect(),
         points,
     }
 }

@@ -1,16 +1,16 @@
 //! Pictures of media whose radiative transfer is known.
 
 use crate::NEVER;
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
 
 /// A log-stretch field in closed form. Every second point counts as traced.
 struct Field<F>(F);
 
 impl<F: Fn([f32; 3]) -> f32> LogStretch for Field<F> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         for (i, point) in points.iter().enumerate() {
-            log_stretch[i] = (self.0)(*point);
+            log_stretch[i] = (self.0)(point.0);
             traced[i] = i % 2 == 0;
         }
     }

@@ -1,8 +1,8 @@
 //! Frames of the renderer: equal on every machine, merging, stopping, bad scenes, the reference scene.
 
 use crate::NEVER;
-use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{Domain, DomainPoint};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, RenderError, RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Mutex;
@@ -20,7 +20,7 @@ impl DoubleGyre {
 }
 
 impl LogStretch for DoubleGyre {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         let mut out = Traced::default();
         self.0.trace(points, Extras::default(), &mut out);
         log_stretch.copy_from_slice(&out.log_stretch);
@@ -32,11 +32,11 @@ impl LogStretch for DoubleGyre {
 struct Waves;
 
 impl LogStretch for Waves {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         for (i, p) in points.iter().enumerate() {
-            let value = (7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos();
-            log_stretch[i] = if p[0] > 1.8 && p[1] < 0.3 { f32::NAN } else { value };
-            traced[i] = p[1] > 0.5;
+            let value = (7.0 * p.0[0] + 3.0 * p.0[2]).sin() * (9.0 * p.0[1]).cos();
+            log_stretch[i] = if p.0[0] > 1.8 && p.0[1] < 0.3 { f32::NAN } else { value };
+            traced[i] = p.0[1] > 0.5;
         }
     }
 }
@@ -161,8 +161,8 @@ fn values_known_from_elsewhere_tighten_the_first_frame() {
         let mut renderer = Renderer::new(waves(32, 16), &gyre_box(), 1.0).unwrap();
         if informed {
             // A table of 200x100x10 nodes.
-            let points: Vec<[f32; 3]> =
-                (0..200_000).map(|i| [(i % 200) as f32 / 100.0, (i / 200 % 100) as f32 / 100.0, (i / 20_000) as f32 / 10.0]).collect();
+            let place = |i: usize| DomainPoint([(i % 200) as f32 / 100.0, (i / 200 % 100) as f32 / 100.0, (i / 20_000) as f32 / 10.0]);
+            let points: Vec<DomainPoint> = (0..200_000).map(place).collect();
             let (mut log_stretch, mut traced) = (vec![0.0; points.len()], vec![false; points.len()]);
             Waves.evaluate(&points, &mut log_stretch, &mut traced);
             renderer.observe(&points, &log_stretch);
@@ -242,7 +242,7 @@ fn bare_files_get_a_view_of_everything() {
         let mut renderer = Renderer::new(scene, &domain, 1.0).unwrap();
         struct Half;
         impl LogStretch for Half {
-            fn evaluate(&mut self, _: &[[f32; 3]], log_stretch: &mut [f32], _: &mut [bool]) {
+            fn evaluate(&mut self, _: &[DomainPoint], log_stretch: &mut [f32], _: &mut [bool]) {
                 log_stretch.fill(0.5);
             }
         }

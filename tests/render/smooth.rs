@@ -1,7 +1,7 @@
 //! Smooth pictures: marching and coupled samples against tracking, and the error that they state.
 
 use crate::NEVER;
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, RaySum, Refinement, ToLight};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Arc;
@@ -9,23 +9,23 @@ use std::sync::Arc;
 const TAU: f64 = 2.0;
 
 /// A field of log-stretch with ridges, and a corner without values.
-fn field(p: [f32; 3]) -> f32 {
+fn field(DomainPoint(p): DomainPoint) -> f32 {
     1.0 + (5.0 * p[0] + 2.0 * p[2]).sin() * (6.0 * p[1] - p[2]).cos()
 }
 
 /// A surrogate that differs from it by up to 0.15 and misses a thin ridge.
-fn nearby(p: [f32; 3]) -> f32 {
-    field(p) + 0.15 * (11.0 * p[0]).sin()
+fn nearby(p: DomainPoint) -> f32 {
+    field(p) + 0.15 * (11.0 * p.0[0]).sin()
 }
 
-fn is_missing(p: [f32; 3]) -> bool {
+fn is_missing(DomainPoint(p): DomainPoint) -> bool {
     p[0] < 0.3 && p[1] < 0.4
 }
 
 struct Traced<F>(F);
 
-impl<F: FnMut([f32; 3]) -> f32> LogStretch for Traced<F> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+impl<F: FnMut(DomainPoint) -> f32> LogStretch for Traced<F> {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         points.iter().zip(log_stretch).for_each(|(p, s)| *s = (self.0)(*p));
         traced.fill(true);
     }
@@ -39,7 +39,7 @@ fn slab() -> Domain {
     Domain::slab([0.0; 2], [1.0; 2], (0.0, 0.5))
 }
 
-fn nodes(domain: &Domain, shape: [usize; 3], of: impl Fn([f32; 3]) -> f32) -> Nodes {
+fn nodes(domain: &Domain, shape: [usize; 3], of: impl Fn(DomainPoint) -> f32) -> Nodes {
     let count = shape.iter().product();
     Nodes::new(shape, Arc::new((0..count).map(|i| of(domain.from_unit(Nodes::unit(shape, i)))).collect()))
 }
@@ -60,7 +60,7 @@ fn point(position: [f64; 3]) -> LightSettings {
 }
 
 /// A tracked picture of `frames` frames of 256 samples.
-fn tracked(scene: &Scene, domain: &Domain, frames: u64, of: impl Fn([f32; 3]) -> f32) -> Film {
+fn tracked(scene: &Scene, domain: &Domain, frames: u64, of: impl Fn(DomainPoint) -> f32) -> Film {
     let mut renderer = Renderer::new(scene.clone(), domain, TAU).unwrap();
     let mut answers = Traced(&of);
     // The first frame tightens the majorants.
@@ -87,7 +87,7 @@ impl Smooth {
         nodes: &Nodes,
         missing: Option<IsMissing<'_>>,
         (method, sum, samples): (Method, bool, f64),
-        of: impl Fn([f32; 3]) -> f32,
+        of: impl Fn(DomainPoint) -> f32,
     ) -> (Film, PictureError) {
         let round = Refinement { nodes, missing, method, sum, samples, number: self.rounds, stop: &NEVER };
         self.rounds += 1;
@@ -146,7 +146,7 @@ fn a_marched_picture_is_the_mean_of_tracked_ones() {
         let nodes = nodes(&domain, shape, field);
         for missing in [false, true] {
             let gone: IsMissing<'_> = &is_missing;
-            let of = |p: [f32; 3]| if missing && is_missing(p) { f32::NAN } else { nodes.at(domain.to_unit(p)) };
+            let of = |p: DomainPoint| if missing && is_missing(p) { f32::NAN } else { nodes.at(domain.to_unit(p)) };
             let truth = [scene.seed, scene.seed + 1].map(|seed| tracked(&Scene { seed, ..scene.clone() }, &domain, 8, of));
             // No difference between the fields: all that is left is the march.
             let (film, stated) = Smooth::new(&scene, &domain).round(&nodes, missing.then_some(gone), (Method::Marched, false, 2.0), of);
@@ -196,8 +196,8 @@ fn the_light_volume_is_exact_in_a_uniform_medium() {
                 let wall = if toward[k] > 0.0 { 1.0 } else { 0.0 };
                 (wall - f64::from(unit[k])) * length / toward[k]
             });
-            let depth = medium.extinction(unit) * exit.fold(f64::INFINITY, f64::min) as f32;
-            worst = worst.max((volume.at(unit) - depth).abs());
+            let depth = medium.extinction(UnitPoint(unit)) * exit.fold(f64::INFINITY, f64::min) as f32;
+            worst = worst.max((volume.at(UnitPoint(unit)) - depth).abs());
         }
     }
     assert!(worst < 1e-4, "{worst:e}");
@@ -209,7 +209,7 @@ fn equal_fields_leave_no_difference() {
     let nodes = nodes(&domain, [17, 17, 17], field);
     let mut renderer = Renderer::new(scene, &domain, TAU).unwrap();
     let paths: Vec<(u32, u32)> = (0..32 * 32).flat_map(|pixel| (0..8).map(move |sample| (pixel, sample))).collect();
-    let mut answers = Traced(|p: [f32; 3]| nodes.at(domain.to_unit(p)));
+    let mut answers = Traced(|p: DomainPoint| nodes.at(domain.to_unit(p)));
     let found = renderer.coupled_paths(3, &nodes, None, &paths, &mut answers);
     let scattered = found.iter().filter(|path| path.queries > 0).count();
     // Unit coordinates are rounded on two ways, which may part a path in many thousands.
@@ -224,7 +224,7 @@ fn the_sum_of_march_and_correction_is_the_traced_picture() {
         let scene = scene(&domain, 32, false, light);
         let nodes = nodes(&domain, [33, 33, 33], nearby);
         let gone: IsMissing<'_> = &is_missing;
-        let of = |p: [f32; 3]| if is_missing(p) { f32::NAN } else { field(p) };
+        let of = |p: DomainPoint| if is_missing(p) { f32::NAN } else { field(p) };
         let truth = tracked(&scene, &domain, 16, of);
         let mut smooth = Smooth::new(&scene, &domain);
         let mut last = None;
@@ -281,7 +281,7 @@ fn corrections_of_any_surrogate_are_unbiased() {
     let corrections = |surrogate: &Nodes| -> Vec<Vec<f64>> {
         let of_seed = |seed: u64| {
             let mut renderer = Renderer::new(Scene { seed: 1000 + seed, ..scene.clone() }, &domain, TAU).unwrap();
-            let mut answers = Traced(|p: [f32; 3]| traced.at(domain.to_unit(p)));
+            let mut answers = Traced(|p: DomainPoint| traced.at(domain.to_unit(p)));
             let found = renderer.coupled_paths(0, surrogate, None, &paths, &mut answers);
             let luminance = |[r, g, b]: [f32; 3]| f64::from(0.2126 * r + 0.7152 * g + 0.0722 * b);
             found
@@ -292,8 +292,8 @@ fn corrections_of_any_surrogate_are_unbiased() {
         (0..SEEDS).map(of_seed).collect()
     };
     let beyond = |found: &[[f64; 2]]| found.iter().filter(|[bias, error]| bias.abs() > LIMIT * error).count();
-    let ridge = |p: [f32; 3]| field(p) + 0.8 * (-((p[0] - 0.53) / 0.03).powi(2)).exp();
-    let surrogates: [(&str, &dyn Fn([f32; 3]) -> f32); 4] =
+    let ridge = |p: DomainPoint| field(p) + 0.8 * (-((p.0[0] - 0.53) / 0.03).powi(2)).exp();
+    let surrogates: [(&str, &dyn Fn(DomainPoint) -> f32); 4] =
         [("good", &nearby), ("untrained", &|_| 1.0), ("off by a constant", &|p| field(p) + 0.3), ("wrong in a thin ridge", &ridge)];
     for (what, of) in surrogates {
         let surrogate = nodes(&domain, [33; 3], of);

@@ -1,6 +1,7 @@
 //! Coupled paths of the kernels against the CPU's, path by path.
 
 use super::*;
+use ridgewatch::field::{DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{CoupledPath, Nodes};
 
 /// Planes of the sums: differences by half, quarter and channel, pairs by quarter, differences of alpha.
@@ -23,8 +24,8 @@ impl Tracer for NearWaves {
     fn steps(&self) -> usize {
         1
     }
-    fn trace(&self, seeds: &[[f32; 3]], _: Extras, out: &mut Traced) {
-        out.log_stretch = seeds.iter().map(|p| 1.05 * (7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos() - 0.02).collect();
+    fn trace(&self, seeds: &[DomainPoint], _: Extras, out: &mut Traced) {
+        out.log_stretch = seeds.iter().map(|p| 1.05 * (7.0 * p.0[0] + 3.0 * p.0[2]).sin() * (9.0 * p.0[1]).cos() - 0.02).collect();
     }
 }
 
@@ -94,7 +95,7 @@ fn round(
 struct Holed<'a>(Option<&'a dyn Tracer>, u64);
 
 impl LogStretch for Holed<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         Waves.evaluate(points, log_stretch, traced);
         for (i, &p) in points.iter().enumerate() {
             if self.0.is_some_and(|tracer| tracer.is_missing(p)) {
@@ -113,7 +114,7 @@ fn none_missing() -> Vec<u8> {
 /// Teaches the majorants values that are too low.
 fn mislead(renderer: &Renderer) {
     let mut random = uniform(12);
-    let points: Vec<[f32; 3]> = (0..20_000).map(|_| domain().from_unit([random(), random(), random()])).collect();
+    let points: Vec<DomainPoint> = (0..20_000).map(|_| domain().from_unit(UnitPoint([random(), random(), random()]))).collect();
     renderer.observe(&points, &vec![0.6; points.len()]);
 }
 
@@ -124,7 +125,7 @@ fn coupled_paths_are_the_same_bits() {
     for (point_light, dimensions, with_missing, misled) in [(false, 3, false, false), (true, 3, true, true), (false, 2, false, true)] {
         let (table, nodes) = surrogate(dimensions);
         let missing_cells = if with_missing { missing_cells_bytes(&*tracer, false) } else { none_missing() };
-        let is_missing = |p: [f32; 3]| tracer.is_missing(p);
+        let is_missing = |p: DomainPoint| tracer.is_missing(p);
         let is_missing: Option<ridgewatch::render::smooth::IsMissing<'_>> = if with_missing { Some(&is_missing) } else { None };
         let scene = scene(point_light, false, misled.then_some([5, 3, 7]));
         let mut reference = Renderer::new(scene, &domain(), 1.0).unwrap();
@@ -226,7 +227,7 @@ fn equal_fields_differ_by_exactly_nothing() {
 struct FromNodes<'a>(&'a Nodes, &'a dyn Tracer);
 
 impl LogStretch for FromNodes<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         traced.fill(false);
         for (value, &p) in log_stretch.iter_mut().zip(points) {
             *value = if self.1.is_missing(p) { f32::NAN } else { self.0.at(domain().to_unit(p)) };
@@ -238,10 +239,10 @@ impl LogStretch for FromNodes<'_> {
 struct Whole<'a>(&'a dyn Tracer);
 
 impl LogStretch for Whole<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
         traced.fill(true);
         for (value, &p) in log_stretch.iter_mut().zip(points) {
-            *value = if self.0.is_missing(p) { f32::NAN } else { (7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos() };
+            *value = if self.0.is_missing(p) { f32::NAN } else { (7.0 * p.0[0] + 3.0 * p.0[2]).sin() * (9.0 * p.0[1]).cos() };
         }
     }
 }
@@ -258,7 +259,7 @@ fn mean_luminance(mut renderer: Renderer, answers: &mut dyn LogStretch) -> (f64,
 fn the_mean_is_the_difference_of_two_tracked_pictures() {
     let (_, nodes) = surrogate(3);
     let tracer = holed(false);
-    let is_missing = |p: [f32; 3]| tracer.is_missing(p);
+    let is_missing = |p: DomainPoint| tracer.is_missing(p);
     let mut renderer = Renderer::new(scene(false, false, Some([5, 3, 7])), &domain(), 1.0).unwrap();
     mislead(&renderer);
     let pixels: Vec<(u32, u32)> = (0..PIXELS as u32 * 200).map(|i| (i % PIXELS as u32, i / PIXELS as u32)).collect();

@@ -1,7 +1,7 @@
 //! The Runge-Kutta steps that a run chooses.
 
 use crate::kit::{flow::quasi_random, scene};
-use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{Extras, FlowMap, Steps, Traced, VelocitySource, cpu_tracer, dormand_prince_tracer};
 use ridgewatch::run::{RunError, RunOptions, RunReport, Setup, Slide, Slides, settled_colours};
 use ridgewatch::trust::TrustSettings;
@@ -49,7 +49,7 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
         let tracer = cpu_tracer(slide.velocity.clone(), &fixed(steps), slide.time).unwrap();
         let colours = settled_colours(plan, &tracer, &slide).unwrap();
         let truth = dormand_prince_tracer(slide.velocity.clone(), &fixed(steps), slide.time, 1e-10).unwrap();
-        let points: Vec<[f32; 3]> = (0..4096).map(|i| plan.domain.from_unit(quasi_random(i).map(|x| x as f32))).collect();
+        let points: Vec<DomainPoint> = (0..4096).map(|i| plan.domain.from_unit(UnitPoint(quasi_random(i).map(|x| x as f32)))).collect();
         let ramps = |tracer: &dyn ridgewatch::flow::Tracer| {
             let mut out = Traced::default();
             tracer.trace(&points, Extras::default(), &mut out);

@@ -4,7 +4,7 @@ use crate::kit::scene;
 use crate::sweep::{
     TOLERANCE, adaptive, bisect, double_gyre, grid, gridded_gyre, gyre, gyre_box, lattice, map, rms, rms_difference, row, traced, window,
 };
-use ridgewatch::field::{Snapshot, Window};
+use ridgewatch::field::{DomainPoint, Snapshot, Window};
 use ridgewatch::flow::Direction;
 use ridgewatch::flow::{Boundary, FlowMap, Interpolation, Precision, Steps, VelocitySource, cpu_tracer, time_resolution};
 use ridgewatch::run::RunOptions;
@@ -91,8 +91,8 @@ fn linear_against_cubic() {
         let both = [Interpolation::Linear, Interpolation::Cubic].map(|interpolation| {
             let error = rms_difference(&traced(&window, &gridded(200, interpolation), 0.0, &seeds), &exact);
             // Seeds on both sides of the cell faces x = k / 8, a millionth apart: the stretch of a smooth flow does not jump.
-            let pairs: Vec<[f32; 3]> = (0..200)
-                .flat_map(|i| [-1.0, 1.0].map(|side| [(1 + i % 15) as f32 / 8.0 + side * 5e-7, 0.0043 * (i + 10) as f32, 0.5]))
+            let pairs: Vec<DomainPoint> = (0..200)
+                .flat_map(|i| [-1.0, 1.0].map(|side| DomainPoint([(1 + i % 15) as f32 / 8.0 + side * 5e-7, 0.0043 * (i + 10) as f32, 0.5])))
                 .collect();
             let short = FlowMap { tau: 0.5, ..gridded(20, interpolation) };
             let jumps = rms(traced(&window, &short, 0.0, &pairs).chunks(2).map(|pair| pair[1] - pair[0]));
@@ -197,10 +197,10 @@ impl Texture {
     }
 
     /// Log-stretches by the tangent (no gap) or by differences.
-    fn stretches(&self, seeds: &[[f32; 3]], steps: usize, gap: Option<f64>) -> Vec<f64> {
+    fn stretches(&self, seeds: &[DomainPoint], steps: usize, gap: Option<f64>) -> Vec<f64> {
         let sigma = |m: [f64; 4]| 0.5 * ((m[0] + m[3]).hypot(m[1] - m[2]) + (m[0] - m[3]).hypot(m[1] + m[2]));
-        let of = |seed: &[f32; 3]| {
-            let p = [f64::from(seed[0]), f64::from(seed[1])];
+        let of = |seed: &DomainPoint| {
+            let p = [f64::from(seed.0[0]), f64::from(seed.0[1])];
             let m = match gap {
                 None => {
                     let s = self.integrate(p, steps);
@@ -345,7 +345,7 @@ fn moving_shock() {
         })
     };
     let map = FlowMap { tau: END, direction: Direction::Backward, boundary: Boundary::Clamp, ..map(END, 640, Precision::F64) };
-    let seeds: Vec<[f32; 3]> = (0..1000).map(|i| [5.0 + 0.004 * (i as f32 + 0.5), 0.5, 0.5]).collect();
+    let seeds: Vec<DomainPoint> = (0..1000).map(|i| DomainPoint([5.0 + 0.004 * (i as f32 + 0.5), 0.5, 0.5])).collect();
     let exact = traced(&VelocitySource::Window(of(0.0125)), &map, END, &seeds);
     let size = rms(exact.iter().copied());
     let mut found = Vec::new();

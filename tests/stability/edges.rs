@@ -3,8 +3,8 @@
 use crate::kit::flow::{DAY, EVERYTHING, quasi_random, rotation, stretches, trace};
 use crate::kit::scene;
 use crate::sweep::{TOLERANCE, bisect, grid, in_square, lattice, map, row, traced};
-use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::{Axis, Domain, EARTH_RADIUS, Geometry, Grid, Snapshot};
+use ridgewatch::field::{DomainPoint, analytic::Analytic};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Normalisation, Precision, VelocitySource};
 use ridgewatch::run::RunOptions;
 use std::sync::Arc;
@@ -38,7 +38,7 @@ fn poles_and_dateline() {
     let tau = 10.0 * DAY;
     let flow = |precision| FlowMap { boundary: Boundary::Stop, interpolation: Interpolation::Cubic, ..map(tau, 100, precision) };
     // A solid rotation stretches nothing. Seeds on a circle of latitude; the path of some passes a pole.
-    let circle = |latitude: f64| (0..72).map(|i| [5.0 * i as f32 + 0.3, latitude as f32, 0.5]).collect::<Vec<[f32; 3]>>();
+    let circle = |latitude: f64| (0..72).map(|i| DomainPoint([5.0 * i as f32 + 0.3, latitude as f32, 0.5])).collect::<Vec<_>>();
     let worst = |source: &VelocitySource, latitude: f64, precision| {
         traced(source, &flow(precision), 0.0, &circle(latitude)).into_iter().map(f64::abs).fold(0.0, f64::max)
     };
@@ -66,7 +66,8 @@ fn poles_and_dateline() {
     ]);
     // The cell between the last longitude and the first.
     let lived = |periodic: bool| {
-        let seeds: Vec<[f32; 3]> = (0..2000).map(quasi_random).map(|p| [(359.0 * p[0]) as f32, (60.0 * p[1] - 30.0) as f32, 0.5]).collect();
+        let seeds: Vec<DomainPoint> =
+            (0..2000).map(quasi_random).map(|p| DomainPoint([(359.0 * p[0]) as f32, (60.0 * p[1] - 30.0) as f32, 0.5])).collect();
         let out = trace(&turned(90.0, true, periodic), &flow(Precision::F32), 0.0, &seeds, Extras::default());
         out.lifetime_share.iter().filter(|&&share| share < 1.0).count() as f64 / seeds.len() as f64
     };
@@ -99,7 +100,7 @@ fn coasts() {
     };
     let ftle = |normalisation, distance: f64| {
         let map = FlowMap { boundary: Boundary::Stop, normalisation, ..map(TIME, 800, Precision::F64) };
-        let out = trace(&source, &map, 0.0, &[[(30.0 - distance) as f32, 2.0, 0.5]], EVERYTHING);
+        let out = trace(&source, &map, 0.0, &[DomainPoint([(30.0 - distance) as f32, 2.0, 0.5])], EVERYTHING);
         (stretches(&out)[0] / TIME, f64::from(out.lifetime_share[0]))
     };
     // From the open sea towards the coast: where the FTLE is off by a tenth.

@@ -3,7 +3,7 @@
 use crate::kit::flow::{EVERYTHING, trace};
 use crate::kit::scene;
 use crate::sweep::{TOLERANCE, adaptive, bisect, double_gyre, gyre_box, in_square, lattice, map, rms_difference, row, traced};
-use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{DomainPoint, analytic::Analytic};
 use ridgewatch::flow::{Extras, FlowError, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
 use ridgewatch::run::RunOptions;
 
@@ -63,13 +63,13 @@ fn steps_beyond_the_stability_limit() {
     // A rate of 1, so that the step is |lambda h|. Rotation: ln |R(iz)| a step. Saddle: its contracting coordinate, R(-z).
     let grows = |flow: &Analytic, z: f64| {
         let map = map(z * COUNT as f64, COUNT, Precision::F64);
-        let out = trace(&in_square(flow.clone()), &map, 0.0, &[[0.0, 0.5, 0.5]], EVERYTHING);
-        if matches!(flow, Analytic::Rotation { .. }) { out.log_stretch_f64[0] > 0.0 } else { out.arrival[0][1].abs() > 0.5 }
+        let out = trace(&in_square(flow.clone()), &map, 0.0, &[DomainPoint([0.0, 0.5, 0.5])], EVERYTHING);
+        if matches!(flow, Analytic::Rotation { .. }) { out.log_stretch_f64[0] > 0.0 } else { out.arrival[0].0[1].abs() > 0.5 }
     };
     let chosen = |flow: &Analytic, tau: f64| {
         let map = FlowMap { steps: Steps::Auto { tolerance: TOLERANCE }, ..map(tau, 1, Precision::F64) };
         let tracer = cpu_tracer(in_square(flow.clone()), &map, 0.0).unwrap();
-        let error = trace(&in_square(flow.clone()), &map, 0.0, &[[0.0, 0.5, 0.5]], Extras::default()).log_stretch_f64[0];
+        let error = trace(&in_square(flow.clone()), &map, 0.0, &[DomainPoint([0.0, 0.5, 0.5])], Extras::default()).log_stretch_f64[0];
         (tau / tracer.steps() as f64, error, tracer.step_choice().unwrap())
     };
     let limits = [
@@ -83,7 +83,7 @@ fn steps_beyond_the_stability_limit() {
         assert!((found / limit - 1.0).abs() < 2e-4, "{name}: {found} {limit}");
         // The error of the FTLE where it just fails, in shares of the rate.
         let tau = 1.2 * found * COUNT as f64;
-        let wrong = traced(&in_square(flow.clone()), &map(tau, COUNT, Precision::F64), 0.0, &[[0.0, 0.5, 0.5]])[0] / tau;
+        let wrong = traced(&in_square(flow.clone()), &map(tau, COUNT, Precision::F64), 0.0, &[DomainPoint([0.0, 0.5, 0.5])])[0] / tau;
         let (z, stretch, choice) = chosen(&flow, 100.0);
         assert!(choice.within_tolerance && z < 0.5 * limit, "auto stays clear of the limit: {z}");
         // The difference to twice as many steps is 15/16 of the error (rotation 31/32: its leading term is damping).
@@ -101,7 +101,8 @@ fn steps_beyond_the_stability_limit() {
     // The gradient of a shear is nilpotent, so that RK4 is exact: g = rate x tau stretches by asinh(g / 2).
     let sheared = |z: f64| {
         let tau = z * COUNT as f64;
-        let stretch = traced(&in_square(Analytic::Shear { rate: 1.0 }), &map(tau, COUNT, Precision::F64), 0.0, &[[0.0, 0.5, 0.5]])[0];
+        let stretch =
+            traced(&in_square(Analytic::Shear { rate: 1.0 }), &map(tau, COUNT, Precision::F64), 0.0, &[DomainPoint([0.0, 0.5, 0.5])])[0];
         (stretch / (0.5 * tau).asinh() - 1.0).abs()
     };
     let worst = [0.1, 1.0, 10.0, 100.0, 1000.0].map(sheared).into_iter().fold(0.0, f64::max);
@@ -120,7 +121,7 @@ fn steps_beyond_the_stability_limit() {
 #[test]
 fn long_tau_overflows_the_jacobian() {
     let source = in_square(Analytic::Saddle { rate: 1.0 });
-    let seed = [[0.25, 0.5, 0.5]];
+    let seed = [DomainPoint([0.25, 0.5, 0.5])];
     // Ten steps a unit: the truncation of the stretch is z^4 / 120 = 8e-7 of it.
     let out = |map: FlowMap| trace(&source, &map, 0.0, &seed, EVERYTHING);
     let with = |tau: f64, integrator, precision| FlowMap { integrator, ..map(tau, (10.0 * tau) as usize, precision) };
@@ -186,7 +187,7 @@ fn chaos_parts_single_from_double_precision() {
         // The same steps, so that only rounding differs.
         let [single, double] = [Precision::F32, Precision::F64]
             .map(|precision| trace(&source, &map(tau, (20.0 * tau) as usize, precision), 0.0, &seeds, EVERYTHING));
-        let apart = |i: &usize| (0..2).map(|k| (single.arrival[*i][k] - double.arrival[*i][k]).powi(2)).sum::<f32>().sqrt() > 0.1;
+        let apart = |i: &usize| (0..2).map(|k| (single.arrival[*i].0[k] - double.arrival[*i].0[k]).powi(2)).sum::<f32>().sqrt() > 0.1;
         let parted = (0..seeds.len()).filter(apart).count() as f64 / seeds.len() as f64;
         let a: Vec<f64> = single.log_stretch.iter().map(|&s| f64::from(s) / tau).collect();
         let b: Vec<f64> = double.log_stretch_f64.iter().map(|&s| s / tau).collect();
@@ -236,7 +237,7 @@ fn chaos_parts_single_from_double_precision() {
 
 #[test]
 fn vanishing_velocity() {
-    let seeds = [[0.25, 0.5, 0.5]];
+    let seeds = [DomainPoint([0.25, 0.5, 0.5])];
     let lost = |precision| {
         bisect(1.0, 1e20, |inverse| {
             let rate = 1.0 / inverse;

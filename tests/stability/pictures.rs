@@ -1,7 +1,7 @@
 //! Pictures: majorants that are too low, marching that is too coarse, corrections whose variance few samples show.
 
 use crate::sweep::{rms, row};
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{
     AUDIT_RAYS, AuditedPixel, LightVolume, MIN_RAYS, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight,
 };
@@ -15,8 +15,8 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 struct Field<F>(F);
 
 impl<F: Fn([f32; 3]) -> f32> LogStretch for Field<F> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
-        points.iter().zip(log_stretch).for_each(|(p, s)| *s = (self.0)(*p));
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
+        points.iter().zip(log_stretch).for_each(|(p, s)| *s = (self.0)(p.0));
         traced.fill(true);
     }
 }
@@ -63,7 +63,7 @@ fn majorant_too_low() {
         let mut renderer = Renderer::new(scene(32, EXTINCTION, Some([1; 3]), 3), &cube(), 1.0).unwrap();
         // Values whose margins (a tenth, 0.02 and 8 over their number; see `src/render/majorant.rs`) give the wanted majorant.
         let told = if low > 0.0 { (RAMP * (1.0 - low) - 0.02 - 8.0 / SEEN as f64) / 1.1 } else { RAMP };
-        renderer.observe(&vec![[0.5; 3]; SEEN], &vec![told as f32; SEEN]);
+        renderer.observe(&vec![DomainPoint([0.5; 3]); SEEN], &vec![told as f32; SEEN]);
         [0, 1].map(|frame| {
             let (film, stats) = renderer.render(frame, &mut Field(|_| RAMP as f32), 256, None, &NEVER).unwrap();
             (opacity(&film), stats.majorant_exceeded as f64 / stats.queries as f64)
@@ -113,7 +113,7 @@ fn majorant_too_low() {
 
 /// Nodes of a unit cube.
 fn nodes(n: usize, of: impl Fn([f32; 3]) -> f32) -> Nodes {
-    Nodes::new([n; 3], Arc::new((0..n * n * n).map(|i| of(Nodes::unit([n; 3], i))).collect()))
+    Nodes::new([n; 3], Arc::new((0..n * n * n).map(|i| of(Nodes::unit([n; 3], i).0)).collect()))
 }
 
 /// Radiance of every pixel, the mean of its first rays. Steps are shares of the distance between nodes; a `light` of 0: by the light volume.
@@ -151,7 +151,7 @@ fn marching_too_coarse() {
         for number in 0..6 {
             let round =
                 Refinement { nodes: &nodes, missing: None, method: Method::Marched, sum: false, samples: 2.0, number, stop: &NEVER };
-            let mut answers = Field(|p: [f32; 3]| nodes.at(p));
+            let mut answers = Field(|p: [f32; 3]| nodes.at(UnitPoint(p)));
             let (film, _, error) = renderer.refine(&mut picture, &round, &mut answers).unwrap();
             stated = error.march_rms / size;
             last = Some((film, error.rays_per_pixel));

@@ -1,8 +1,8 @@
 //! Sweeps, errors, and the rows that they print.
 
 use crate::kit::flow::{stretches, trace};
-use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{Extras, FlowMap, Integrator, Precision, VelocitySource};
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -41,13 +41,13 @@ pub fn rms_difference(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// Midpoints of a lattice over a domain, in the plane.
-pub fn lattice(domain: &Domain, [nx, ny]: [usize; 2]) -> Vec<[f32; 3]> {
-    let unit = |n: usize| [((n % nx) as f32 + 0.5) / nx as f32, ((n / nx) as f32 + 0.5) / ny as f32, 0.5];
+pub fn lattice(domain: &Domain, [nx, ny]: [usize; 2]) -> Vec<DomainPoint> {
+    let unit = |n: usize| UnitPoint([((n % nx) as f32 + 0.5) / nx as f32, ((n / nx) as f32 + 0.5) / ny as f32, 0.5]);
     (0..nx * ny).map(|n| domain.from_unit(unit(n))).collect()
 }
 
 /// Log-stretches of seeds.
-pub fn traced(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Vec<f64> {
+pub fn traced(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Vec<f64> {
     stretches(&trace(source, map, t0, seeds, Extras::default()))
 }
 

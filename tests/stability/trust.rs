@@ -2,7 +2,7 @@
 
 use crate::sweep::{bisect, row};
 use ridgewatch::backend::{stratified_points, trusted_error};
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, UnitPoint};
 use ridgewatch::render::rng::{philox, unit};
 use ridgewatch::trust::{Audited, Gate, REJECTED, Residual, Strata, TrustMap, TrustSettings, TrustedError};
 
@@ -28,7 +28,7 @@ impl Loop {
         Self { map: TrustMap::new(&TrustSettings::default(), &domain), frame: 0, seed }
     }
 
-    fn audit(&self, strata: Strata, residual: &dyn Fn([f32; 3], f64) -> f64) -> Audited {
+    fn audit(&self, strata: Strata, residual: &dyn Fn(UnitPoint, f64) -> f64) -> Audited {
         let points = stratified_points(&strata, self.seed, self.frame);
         let residuals: Vec<Residual> = (0..)
             .zip(points)
@@ -40,7 +40,7 @@ impl Loop {
         Audited::of(&residuals, strata)
     }
 
-    fn frame(&mut self, residual: impl Fn([f32; 3], f64) -> f64) -> Stated {
+    fn frame(&mut self, residual: impl Fn(UnitPoint, f64) -> f64) -> Stated {
         let gate = self.map.gate();
         let audited = self.audit(self.map.audit_strata(&gate, 8), &residual);
         let error = trusted_error(&audited, &gate);
@@ -52,7 +52,7 @@ impl Loop {
     }
 
     /// Frames until the gate is open.
-    fn opened(seed: u64, residual: impl Fn([f32; 3], f64) -> f64 + Copy) -> Self {
+    fn opened(seed: u64, residual: impl Fn(UnitPoint, f64) -> f64 + Copy) -> Self {
         let mut run = Self::new(seed);
         (0..12).for_each(|_| drop(run.frame(residual)));
         run
@@ -71,7 +71,8 @@ fn residuals_that_few_points_hit() {
     let mut found = Vec::new();
     for exponent in [-2.5, -3.0, -3.25, -3.5, -3.75, -4.0, -4.5, -5.0] {
         let share = 10f64.powf(exponent);
-        let residual = move |_: [f32; 3], random: f64| if random < share { LARGE } else { skewed(0.002, (random - share) / (1.0 - share)) };
+        let residual =
+            move |_: UnitPoint, random: f64| if random < share { LARGE } else { skewed(0.002, (random - share) / (1.0 - share)) };
         let truth = (share * LARGE * LARGE + (1.0 - share) * 4e-6).sqrt();
         let (mut held, mut stated, mut points) = (0, 0.0, 0.0);
         let mut run = Loop::opened(5, residual);
@@ -225,7 +226,7 @@ fn evidence_of_a_gate_that_promises_too_much() {
 fn a_slide_doubles_the_error() {
     // Until the next audit the error after a slide is unknown: cells stay trusted only if twice their error is within the tolerance.
     let open = |rms: f64, slides: bool| {
-        let constant = move |_: [f32; 3], _: f64| rms;
+        let constant = move |_: UnitPoint, _: f64| rms;
         let mut run = Loop::new(3);
         (0..12).for_each(|_| drop(run.frame(constant)));
         // Many samples, so that the loss of weight alone does not close the gate.
@@ -283,14 +284,14 @@ fn a_hot_spot_thinner_than_a_cell() {
             let [dx, dy, _] = domain_cell(&run.map);
             // A strip of the cell in which the surrogate is entirely wrong, such as a ridge between its nodes.
             let (cell, strip) = ([7.0 * dx, 5.0 * dy], share as f32 * dx);
-            let spot = move |p: [f32; 3], _: f64| {
+            let spot = move |UnitPoint(p): UnitPoint, _: f64| {
                 let inside = p[0] >= cell[0] && p[0] < cell[0] + strip && p[1] >= cell[1] && p[1] < cell[1] + dy;
                 if inside { 1.0 } else { 0.004 }
             };
             let place = [cell[0] + 0.5 * dx, cell[1] + 0.5 * dy, 0.5];
             frames.push((1..=LIMIT).find(|_| {
                 run.frame(spot);
-                !run.map.gate().trusts(place)
+                !run.map.gate().trusts(UnitPoint(place))
             }));
         }
         let mean = frames.iter().map(|f| f64::from(f.unwrap_or(LIMIT))).sum::<f64>() / frames.len() as f64;

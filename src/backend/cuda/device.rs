@@ -10,6 +10,7 @@ use crate::{
     AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
     Rendered, Surrogate, SurrogateRequest, WhenLost, audit,
 };
+use ridgewatch_field::UnitPoint;
 use ridgewatch_flow::{FlowMap, VelocitySource};
 use ridgewatch_render::Renderer;
 use ridgewatch_source::Listener;
@@ -257,10 +258,10 @@ impl Predict for CudaFrozen {
     fn name(&self) -> &'static str {
         either!(CudaFrozen, self, frozen => frozen.name())
     }
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         either!(CudaFrozen, self, frozen => frozen.predict(points, out))
     }
-    fn seconds(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<f64, DeviceError> {
+    fn seconds(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<f64, DeviceError> {
         match self {
             Self::Resident(frozen) => seconds_of_prediction(frozen, points),
             Self::OnHost(frozen) => frozen.seconds(points, out),

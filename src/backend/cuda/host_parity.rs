@@ -5,9 +5,9 @@ use crate::cuda::layout::{DeviceReal, Outputs, ResultPolicy};
 use crate::cuda::tracing::trace::{ClosedArguments, result_policy};
 use crate::cuda::window::grid::{GridArguments, Nodes, WindowFlowMap};
 use crate::cuda::{DeviceError, Storage};
-use ridgewatch_field::analytic::Analytic;
 use ridgewatch_field::turbulence::Turbulence;
 use ridgewatch_field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch_field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch_flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
@@ -35,7 +35,7 @@ pub(super) fn library(folder: &Path, source: &str, defines: &[String]) -> libloa
 }
 
 /// Runs the kernel's code on the host, with outputs set to NaN before. `t0`: `None` if every seed has its own start time.
-fn host(source: &VelocitySource, map: &FlowMap, t0: impl Into<Option<f64>>, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+fn host(source: &VelocitySource, map: &FlowMap, t0: impl Into<Option<f64>>, storage: Storage, seeds: &[DomainPoint]) -> Traced {
     let t0 = t0.into();
     match map.precision {
         Precision::F32 => host_in::<f32>(source, map, t0, storage, seeds),
@@ -43,7 +43,7 @@ fn host(source: &VelocitySource, map: &FlowMap, t0: impl Into<Option<f64>>, stor
     }
 }
 
-fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<f64>, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<f64>, storage: Storage, seeds: &[DomainPoint]) -> Traced {
     let Steps::Fixed(steps) = map.steps else { panic!("fixed steps") };
     let t0 = start.unwrap_or(0.0);
     let to = t0 + map.direction.sign() * map.tau;
@@ -88,7 +88,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
         lifetime_share: vec![f32::NAN; n],
-        arrival: vec![[f32::NAN; 3]; n],
+        arrival: vec![DomainPoint([f32::NAN; 3]); n],
         jacobian: vec![[f32::NAN; 9]; n],
     };
     let outputs = Outputs {
@@ -143,17 +143,17 @@ fn encoded(snapshot: &Snapshot, next: Option<&Snapshot>, storage: Storage) -> Ve
 }
 
 /// Random points, different in every run.
-fn fresh(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+fn fresh(domain: &Domain, count: usize) -> Vec<DomainPoint> {
     let state = RandomState::new();
     let uniform = |i: usize| {
         let mut hasher = state.build_hasher();
         hasher.write_usize(i);
         (hasher.finish() >> 40) as f32 / (1u32 << 24) as f32
     };
-    (0..count).map(|i| domain.from_unit([uniform(3 * i), uniform(3 * i + 1), uniform(3 * i + 2)])).collect()
+    (0..count).map(|i| domain.from_unit(UnitPoint([uniform(3 * i), uniform(3 * i + 1), uniform(3 * i + 2)]))).collect()
 }
 
-fn cpu(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Traced {
+fn cpu(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Traced {
     let mut out = Traced::default();
     cpu_tracer(source.clone(), map, t0).unwrap().trace(seeds, Extras { arrival: true, jacobian: true }, &mut out);
     out
@@ -196,7 +196,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{name}: seed {:?}: {a} {b}", seeds[i]);
         died += usize::from(exact.lifetime_share[i] < 1.0);
         for k in 0..3 {
-            let (a, b) = (exact.arrival[i][k], double.arrival[i][k]);
+            let (a, b) = (exact.arrival[i].0[k], double.arrival[i].0[k]);
             // Both are rounded to single precision.
             assert!((a - b).abs() <= 4.0 * f32::EPSILON * a.abs().max(1.0), "{name}: arrival {a} {b}");
         }
@@ -270,7 +270,7 @@ fn closed_forms_with_starts() {
         let found = host(&gyre, &map, None, Storage::F32, &seeds);
         let single = host(&gyre, &FlowMap { precision: Precision::F32, ..map.clone() }, None, Storage::F32, &seeds);
         for (i, &seed) in seeds.iter().enumerate() {
-            let exact = cpu(&gyre, &map, f64::from(seed[2]), &[seed]);
+            let exact = cpu(&gyre, &map, f64::from(seed.0[2]), &[seed]);
             let (a, b) = (exact.log_stretch_f64[0], found.log_stretch_f64[i]);
             assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{direction:?} {integrator:?} {seed:?}: {a} {b}");
             // In single precision, differences over a step of 1e-4 keep about three of seven digits.

@@ -7,11 +7,12 @@
 
 use super::march::{IsMissing, Medium};
 use super::nodes::Nodes;
-use crate::LogStretch;
 use crate::rng::unit;
 use crate::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};
+use crate::{GridPoint, LogStretch};
 use rayon::prelude::*;
 use ridgewatch_base::progress;
+use ridgewatch_field::DomainPoint;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Index of the traced field; the other is the surrogate, which counts negative.
@@ -49,7 +50,7 @@ struct Particle {
 /// A ray segment that is walked.
 #[derive(Debug, Clone, Copy, Default)]
 struct Segment {
-    origin: [f32; 3],
+    origin: GridPoint,
     direction: [f32; 3],
     t: f32,
     end: f32,
@@ -57,8 +58,8 @@ struct Segment {
 
 impl Segment {
     #[inline]
-    fn point(&self) -> [f32; 3] {
-        std::array::from_fn(|k| self.origin[k] + self.t * self.direction[k])
+    fn point(&self) -> GridPoint {
+        self.origin.along(self.direction, self.t)
     }
 }
 
@@ -113,8 +114,8 @@ impl CoupledFlight {
         if self.in_shadow { &mut self.shadow } else { &mut self.camera }
     }
 
-    /// Domain coordinates of the pending collision.
-    pub(super) fn point(&self, medium: &Medium<'_>) -> [f32; 3] {
+    /// The pending collision.
+    pub(super) fn point(&self, medium: &Medium<'_>) -> DomainPoint {
         medium.scene.space.domain_point(if self.in_shadow { self.shadow.point() } else { self.camera.point() })
     }
 

@@ -4,7 +4,7 @@
 use super::{ErrorEstimate, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
 use crate::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, Target, TransferSettings};
 use rayon::prelude::*;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -15,14 +15,15 @@ const SEEDS: u64 = 24;
 struct Traced<'a>(&'a Nodes);
 
 impl LogStretch for Traced<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
-        points.iter().zip(log_stretch).for_each(|(p, s)| *s = self.0.at(*p));
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
+        // The domain is the unit cube.
+        points.iter().zip(log_stretch).for_each(|(p, s)| *s = self.0.at(UnitPoint(p.0)));
         traced.fill(true);
     }
 }
 
 fn nodes(of: impl Fn([f32; 3]) -> f32) -> Nodes {
-    Nodes::new([NODES; 3], Arc::new((0..NODES.pow(3)).map(|i| of(Nodes::unit([NODES; 3], i))).collect()))
+    Nodes::new([NODES; 3], Arc::new((0..NODES.pow(3)).map(|i| of(Nodes::unit([NODES; 3], i).0)).collect()))
 }
 
 fn ridges(p: [f32; 3]) -> f32 {

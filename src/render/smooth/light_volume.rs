@@ -8,6 +8,7 @@
 use super::march::{Medium, node_spacing};
 use crate::Light;
 use rayon::prelude::*;
+use ridgewatch_field::UnitPoint;
 use std::ops::RangeInclusive;
 
 /// Optical depth to the light at any point of the box.
@@ -122,7 +123,7 @@ impl LightVolume {
                 .map(|i| {
                     let [nx, ny, _] = grid.nodes;
                     let node = [i % nx, i / nx % ny, i / (nx * ny)];
-                    let unit = std::array::from_fn(|k| node[k] as f32 / cells[k]);
+                    let unit = UnitPoint(std::array::from_fn(|k| node[k] as f32 / cells[k]));
                     medium.depth_to_light(space.grid_of_unit(unit), grid.step)
                 })
                 .collect(),
@@ -178,13 +179,13 @@ impl LightVolume {
                 return 0.0;
             }
         }
-        medium.extinction(std::array::from_fn(|k| (place[k] / cells[k]).clamp(0.0, 1.0)))
+        medium.extinction(UnitPoint(std::array::from_fn(|k| (place[k] / cells[k]).clamp(0.0, 1.0))))
     }
 
-    /// Optical depth from a point in unit coordinates to the light.
+    /// Optical depth from a point to the light.
     #[inline]
-    pub fn at(&self, unit: [f32; 3]) -> f32 {
-        let place: [f32; 3] = std::array::from_fn(|k| unit[k].clamp(0.0, 1.0) * self.cells[k]);
+    pub fn at(&self, unit: UnitPoint) -> f32 {
+        let place: [f32; 3] = std::array::from_fn(|k| unit.0[k].clamp(0.0, 1.0) * self.cells[k]);
         let lower = |x: f32, n: usize| (x.floor() as usize).min(n - 2);
         let between = |a: f32, b: f32, f: f32| (b - a).mul_add(f, a);
         let size = self.grid.size;

@@ -6,9 +6,10 @@
 
 use super::light_volume::LightVolume;
 use super::nodes::Nodes;
-use crate::Light;
 use crate::rng::unit;
 use crate::tracking::{FrameScene, PHASE};
+use crate::{GridPoint, Light};
+use ridgewatch_field::{DomainPoint, UnitPoint};
 
 /// Transmittance below which the rest of a ray is not marched.
 const OPAQUE: f32 = 1e-4;
@@ -17,8 +18,8 @@ const MAX_POINTS: f32 = 65_536.0;
 /// Third counter word of the random shift of a pixel's rays, which no path reaches.
 const SHIFT_DIMENSION: u32 = u32::MAX - 1;
 
-/// Whether a domain point lies in a missing cell.
-pub type IsMissing<'a> = &'a (dyn Fn([f32; 3]) -> bool + Sync);
+/// Whether a point lies in a missing cell.
+pub type IsMissing<'a> = &'a (dyn Fn(DomainPoint) -> bool + Sync);
 
 /// What is marched through.
 #[derive(Clone, Copy)]
@@ -90,30 +91,30 @@ impl Medium<'_> {
         node_spacing(self.scene.space.edges(), self.nodes.shape())
     }
 
-    /// FTLE of the surrogate at a point in unit coordinates; `None` in missing cells.
+    /// FTLE of the surrogate at a point; `None` in missing cells.
     #[inline]
-    pub fn ftle(&self, unit: [f32; 3]) -> Option<f32> {
+    pub fn ftle(&self, unit: UnitPoint) -> Option<f32> {
         if self.missing.is_some_and(|missing| missing(self.scene.space.domain_point(self.scene.space.grid_of_unit(unit)))) {
             return None;
         }
         Some(self.nodes.at(unit) * self.scene.inverse_tau)
     }
 
-    /// Extinction at a point in unit coordinates, per scene length.
+    /// Extinction at a point, per scene length.
     #[inline]
-    pub fn extinction(&self, unit: [f32; 3]) -> f32 {
+    pub fn extinction(&self, unit: UnitPoint) -> f32 {
         self.ftle(unit).map_or(0.0, |ftle| self.scene.transfer.extinction(ftle))
     }
 
-    /// Optical depth from a point (grid coordinates) to the light, by the midpoint rule.
-    pub fn depth_to_light(&self, point: [f32; 3], step: f32) -> f32 {
+    /// Optical depth from a point to the light, by the midpoint rule.
+    pub fn depth_to_light(&self, point: GridPoint, step: f32) -> f32 {
         let space = self.scene.space;
         let (direction, distance, _) = self.scene.light.seen_from(space.scene_point(point));
         let direction = space.grid_direction(direction);
         let length = space.exit(point, direction).min(distance as f32);
         let count = (length / step).ceil().clamp(1.0, MAX_POINTS);
         let step = length / count;
-        let at = |i: usize| space.unit_of_grid(std::array::from_fn(|k| point[k] + (i as f32 + 0.5) * step * direction[k]));
+        let at = |i: usize| space.unit_of_grid(point.along(direction, (i as f32 + 0.5) * step));
         (0..count as usize).map(|i| self.extinction(at(i))).sum::<f32>() * step
     }
 
@@ -137,18 +138,18 @@ impl Medium<'_> {
         let length = (leave - enter) as f32;
         let count = (length / step).ceil().clamp(1.0, MAX_POINTS);
         let (step, count) = (length / count, count as usize);
-        let (start, along) = (space.unit_of_grid(origin), space.unit_of_grid(direction));
+        let (start, along) = (space.unit_of_grid(origin), space.unit_direction(direction));
         let (mut sum, mut transmittance, mut in_missing, mut i) = (RaySum::default(), 1.0_f32, 0_usize, 0);
         while i < count && transmittance >= OPAQUE {
             let t = (i as f32 + offset[2]) * step;
-            let unit: [f32; 3] = std::array::from_fn(|k| start[k] + t * along[k]);
+            let unit = UnitPoint(std::array::from_fn(|k| start.0[k] + t * along[k]));
             if self.missing.is_none()
                 && let Some((low, high)) = self.nodes.empty_brick(unit, scene.transfer, scene.inverse_tau)
             {
                 let mut exit = f32::INFINITY;
                 for k in 0..3 {
                     if along[k] != 0.0 {
-                        exit = exit.min(((if along[k] > 0.0 { high[k] } else { low[k] }) - start[k]) / along[k]);
+                        exit = exit.min(((if along[k] > 0.0 { high.0[k] } else { low.0[k] }) - start.0[k]) / along[k]);
                     }
                 }
                 i = (i + 1).max(((exit / step - offset[2]).ceil().max(0.0) as usize).min(count));
@@ -165,7 +166,7 @@ impl Medium<'_> {
             }
             let absorbed = 1.0 - (-extinction * step).exp();
             let weight = transmittance * absorbed;
-            let grid = std::array::from_fn(|k| origin[k] + t * direction[k]);
+            let grid = origin.along(direction, t);
             let radiance = match scene.light {
                 Light::Directional { radiance, .. } => *radiance,
                 Light::Point { .. } => scene.light.seen_from(space.scene_point(grid)).2,

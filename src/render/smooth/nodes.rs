@@ -2,6 +2,7 @@
 
 use crate::Transfer;
 use rayon::prelude::*;
+use ridgewatch_field::UnitPoint;
 use std::sync::Arc;
 
 /// Cells along the edge of a brick.
@@ -56,10 +57,10 @@ impl Nodes {
         &self.brick_max
     }
 
-    /// Unit coordinates of a node. A flow without z is asked in the middle of its slab.
-    pub fn unit(shape: [usize; 3], index: usize) -> [f32; 3] {
+    /// Where a node lies. A flow without z is asked in the middle of its slab.
+    pub fn unit(shape: [usize; 3], index: usize) -> UnitPoint {
         let node = [index % shape[0], index / shape[0] % shape[1], index / (shape[0] * shape[1])];
-        std::array::from_fn(|k| if shape[k] > 1 { node[k] as f32 / (shape[k] - 1) as f32 } else { 0.5 })
+        UnitPoint(std::array::from_fn(|k| if shape[k] > 1 { node[k] as f32 / (shape[k] - 1) as f32 } else { 0.5 }))
     }
 
     /// Cell and fraction along an axis.
@@ -71,10 +72,10 @@ impl Nodes {
         (cell, position - cell as f32)
     }
 
-    /// Log-stretch at a point in unit coordinates, moved into [0, 1].
+    /// Log-stretch at a point, moved into [0, 1].
     #[inline]
-    pub fn at(&self, unit: [f32; 3]) -> f32 {
-        let ((x, fx), (y, fy)) = (self.place(0, unit[0]), self.place(1, unit[1]));
+    pub fn at(&self, unit: UnitPoint) -> f32 {
+        let ((x, fx), (y, fy)) = (self.place(0, unit.0[0]), self.place(1, unit.0[1]));
         let (row, values) = (self.shape[0], &**self.values);
         let between = |a: f32, b: f32, f: f32| (b - a).mul_add(f, a);
         let plane = |first: usize| {
@@ -85,19 +86,19 @@ impl Nodes {
         if self.shape[2] == 1 {
             return plane(first);
         }
-        let (z, fz) = self.place(2, unit[2]);
+        let (z, fz) = self.place(2, unit.0[2]);
         let layer = row * self.shape[1];
         between(plane(z * layer + first), plane((z + 1) * layer + first), fz)
     }
 
-    /// The walls of the brick around a point, in unit coordinates, if the transfer function shows nothing of that brick.
+    /// The lower and upper corner of the brick around a point, if the transfer function shows nothing of that brick.
     #[inline]
-    pub(super) fn empty_brick(&self, unit: [f32; 3], transfer: &Transfer, inverse_tau: f32) -> Option<([f32; 3], [f32; 3])> {
+    pub(super) fn empty_brick(&self, unit: UnitPoint, transfer: &Transfer, inverse_tau: f32) -> Option<(UnitPoint, UnitPoint)> {
         let (mut brick, mut stride) = (0, 1);
         let (mut low, mut high) = ([0.0; 3], [1.0; 3]);
         for k in 0..3 {
             if self.shape[k] > 1 {
-                let own = self.place(k, unit[k]).0 / BRICK;
+                let own = self.place(k, unit.0[k]).0 / BRICK;
                 brick += own * stride;
                 let per_cell = 1.0 / (self.shape[k] - 1) as f32;
                 low[k] = (own * BRICK) as f32 * per_cell;
@@ -105,6 +106,6 @@ impl Nodes {
             }
             stride *= self.brick_shape[k];
         }
-        (transfer.ramp(self.brick_max[brick] * inverse_tau) <= 0.0).then_some((low, high))
+        (transfer.ramp(self.brick_max[brick] * inverse_tau) <= 0.0).then_some((UnitPoint(low), UnitPoint(high)))
     }
 }

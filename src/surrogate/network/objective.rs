@@ -8,6 +8,7 @@ use super::memory::Outputs;
 use super::settings::{Loss, NetworkSettings, Target};
 use crate::Samples;
 use rayon::prelude::*;
+use ridgewatch_field::UnitPoint;
 use ridgewatch_flow::log_stretch;
 use serde::{Deserialize, Serialize};
 
@@ -48,7 +49,7 @@ pub struct Objective {
 /// Scalar field over the unit domain.
 pub trait Field: Sync {
     /// Writes the value at each unit point.
-    fn values(&self, points: &[[f32; 3]], out: &mut [f32]);
+    fn values(&self, points: &[UnitPoint], out: &mut [f32]);
 }
 
 /// sign(y) ln(1 + |y|), which is defined for FTLE below -1 too.
@@ -106,11 +107,11 @@ impl Objective {
         let is_labelled = match self.target {
             Target::Ftle => samples.log_stretch.get(index).is_some_and(|s| s.is_finite()),
             Target::FlowMap => {
-                samples.arrival.get(index).is_some_and(|a| finite(a))
+                samples.arrival.get(index).is_some_and(|a| finite(&a.0))
                     && (!self.derivatives() || samples.jacobian.get(index).is_some_and(|j| finite(j)))
             }
         };
-        is_labelled && finite(&samples.points[index])
+        is_labelled && finite(&samples.points[index].0)
     }
 
     /// The values of sample `index`, before standardisation.
@@ -121,7 +122,7 @@ impl Objective {
             (Target::Ftle, Loss::Published) => values[0] = signed_log(samples.log_stretch[index] / self.tau),
             (Target::FlowMap, _) => {
                 for (value, &axis) in values.iter_mut().zip(shape.space()) {
-                    *value = samples.arrival[index][axis] - samples.points[index][axis];
+                    *value = samples.arrival[index].0[axis] - samples.points[index].0[axis];
                 }
             }
         }

@@ -6,6 +6,7 @@ use super::objective::Objective;
 use super::settings::Target;
 use super::tile::{Parameters, Weights};
 use super::times::row;
+use ridgewatch_field::UnitPoint;
 
 /// Layers packed for prediction.
 pub struct Predictor {
@@ -24,7 +25,7 @@ impl Predictor {
         shape: &Architecture,
         objective: &Objective,
         tables: &[f32],
-        points: &[[f32; 3]],
+        points: &[UnitPoint],
         times: [f32; 2],
         out: &mut [f32],
     ) {

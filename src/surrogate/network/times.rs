@@ -1,6 +1,7 @@
 //! Start time and duration as inputs: their ranges, and the columns that a network reads.
 
 use super::settings::{Input, NetworkSettings};
+use ridgewatch_field::UnitPoint;
 
 /// Names of the columns of a [`Row`].
 pub(super) const COLUMN_NAMES: [&str; 5] = ["x", "y", "z", "start", "duration"];
@@ -15,7 +16,7 @@ pub type Row = [f32; COLUMN_NAMES.len()];
 pub const UNTIMED: [f32; 2] = [0.0, 1.0];
 
 /// The row of a unit point.
-pub fn row([x, y, z]: [f32; 3], [start, duration]: [f32; 2]) -> Row {
+pub fn row(UnitPoint([x, y, z]): UnitPoint, [start, duration]: [f32; 2]) -> Row {
     [x, y, z, start, duration]
 }
 

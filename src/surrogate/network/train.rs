@@ -11,6 +11,7 @@ use super::random::draw;
 use super::tile::{Parameters, Tile, Weights};
 use crate::Samples;
 use rayon::prelude::*;
+use ridgewatch_field::UnitPoint;
 
 /// Held-out samples are one in this many, if a step holds samples out.
 pub const HELD_OUT: usize = 64;
@@ -142,7 +143,7 @@ impl Fused {
             let mut sum = 0.0;
             let mut below = [0.0; TILE_ROWS];
             if let Some(base) = step.base {
-                let mut points = [[0.0; 3]; TILE_ROWS];
+                let mut points = [UnitPoint::default(); TILE_ROWS];
                 for (point, &index) in points.iter_mut().zip(drawn) {
                     *point = samples.points[index];
                 }

@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::{HostTraining, Samples, Table};
-use ridgewatch_field::Domain;
 use ridgewatch_field::analytic::Analytic;
+use ridgewatch_field::{Domain, UnitPoint};
 use ridgewatch_flow::{FlowMap, VelocitySource, cpu_tracer};
 use std::sync::Mutex;
 use std::time::Duration;
@@ -82,7 +82,7 @@ fn tracer() -> Box<dyn Tracer> {
 }
 
 fn labels() -> ReplayBuffer {
-    let points: Vec<[f32; 3]> = (0..1000).map(|i| [i as f32 / 1000.0, (i % 7) as f32 / 7.0, 0.5]).collect();
+    let points: Vec<UnitPoint> = (0..1000).map(|i| UnitPoint([i as f32 / 1000.0, (i % 7) as f32 / 7.0, 0.5])).collect();
     ReplayBuffer::holding(&Samples { log_stretch: vec![0.7; points.len()], points, ..Samples::default() })
 }
 

@@ -4,7 +4,7 @@
 mod support;
 
 use libfuzzer_sys::fuzz_target;
-use ridgewatch::field::Domain;
+use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Extras, Traced, Tracer};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostSurrogate, Kind, Predict, SurrogateSettings, build};
@@ -27,7 +27,7 @@ impl Tracer for Still {
     fn steps(&self) -> usize {
         1
     }
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) {
         out.log_stretch = vec![0.0; seeds.len()];
         out.lifetime_share = vec![1.0; seeds.len()];
         out.arrival = if extras.arrival { seeds.to_vec() } else { Vec::new() };
@@ -66,7 +66,7 @@ impl Target {
     }
 
     fn predictions(&self) -> Vec<u32> {
-        let points: Vec<[f32; 3]> = (0..16).map(|i| [i as f32 / 16.0, 0.3, 0.5]).collect();
+        let points: Vec<UnitPoint> = (0..16).map(|i| UnitPoint([i as f32 / 16.0, 0.3, 0.5])).collect();
         let mut out = vec![0.0; points.len()];
         self.surrogate.predict(&points, &mut out).expect("the CPU");
         out.iter().map(|value| value.to_bits()).collect()

@@ -3,6 +3,7 @@
 use crate::cuda::host_parity::{half, library};
 use crate::cuda::network::layout::{GridArgument, ReadingArgument};
 use crate::cuda::network::network::{further_places, grid, network_defines, placed_times, reading};
+use ridgewatch_field::UnitPoint;
 use ridgewatch_surrogate::network::{Architecture, Encoding, Input, Loss, NetworkSettings, Objective, Predictor, Scale, Target, uniform};
 
 type HostPredict = unsafe extern "C" fn(*const GridArgument, *const u16, *const f32, *const ReadingArgument, *const f32, u32, *mut f32);
@@ -27,8 +28,9 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
         layers[layer.weights..layer.biases].iter_mut().for_each(|weight| *weight *= 2.0 * spread);
     }
     let times = [0.3, 0.8];
-    let mut points: Vec<[f32; 3]> = values(3, 3 * POINTS).chunks_exact(3).map(|p| [p[0], p[1], p[2]].map(|x| 0.5 * x + 0.5)).collect();
-    points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]]);
+    let mut points: Vec<UnitPoint> =
+        values(3, 3 * POINTS).chunks_exact(3).map(|p| UnitPoint([p[0], p[1], p[2]].map(|x| 0.5 * x + 0.5))).collect();
+    points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]].map(UnitPoint));
 
     let mut expected = vec![f32::NAN; points.len()];
     Predictor::new(&shape, &layers).log_stretch(&shape, &objective, &tables, &points, times, &mut expected);
@@ -59,11 +61,11 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
             assert!((found - expected).abs() <= 2e-4 * expected.abs().max(1.0), "{name}, {how}, {point:?}: {found}, not {expected}");
         }
     };
-    compare(&found(&points, &given), "given times");
+    compare(&found(bytemuck::cast_slice(&points), &given), "given times");
     // The same times in the points, each at its place.
     let placed = placed_times(&shape, Some(times));
     let with_times: Vec<[f32; 3]> =
-        points.iter().map(|p| std::array::from_fn(|k| if placed[k].is_nan() { p[k] } else { placed[k] })).collect();
+        points.iter().map(|p| std::array::from_fn(|k| if placed[k].is_nan() { p.0[k] } else { placed[k] })).collect();
     let further: Vec<f32> = points.iter().flat_map(|_| placed[3..][..further_places(&shape)].to_vec()).collect();
     let further = if further.is_empty() { 0 } else { further.as_ptr() as u64 };
     compare(&found(&with_times, &ReadingArgument { times: [f32::NAN; 5], further, ..given }), "times of points");

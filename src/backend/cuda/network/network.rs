@@ -11,7 +11,7 @@ use crate::cuda::network::batched::{Batched, GradientTo, Tiling};
 use crate::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
 use crate::cuda::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, UnitPoint};
 use ridgewatch_surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use std::sync::Arc;
 
@@ -93,7 +93,7 @@ pub(super) fn sample_float4s(shape: &Architecture) -> usize {
 /// Unit times at their places; NaN at the other places. Without `times` a point supplies its own values at its three places.
 pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> PlacedTimes {
     let mut placed = [f32::NAN; 5];
-    let row: Row = row([f32::NAN; 3], times.unwrap_or(UNTIMED));
+    let row: Row = row(UnitPoint([f32::NAN; 3]), times.unwrap_or(UNTIMED));
     for (place, &column) in places(shape).into_iter().zip(&shape.axes) {
         if times.is_some() || place >= POINT {
             placed[place] = row[column];

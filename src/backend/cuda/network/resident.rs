@@ -10,7 +10,8 @@ use crate::cuda::driver::Gpu;
 use crate::cuda::layout::Outputs;
 use crate::cuda::rendering::{DeviceLearns, DevicePredict, HELD_BACK};
 use crate::cuda::tracing::{CudaTracer, DeviceTable};
-use ridgewatch_field::Domain;
+use bytemuck::cast_slice;
+use ridgewatch_field::{Domain, UnitPoint};
 use ridgewatch_surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
 use ridgewatch_surrogate::{
     BufferMark, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice, SurrogateTable, SyncedSamples,
@@ -46,7 +47,7 @@ impl SurrogateDevice for OnGpu {
         Ok(CudaTable::new(DeviceTable::trace(tracer.device(), tracer.host().domain(), nodes)?))
     }
 
-    fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+    fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         match frozen_parts(frozen)? {
             (Some(table), None) => predict_from_host(table.gpu(), table, points, out),
             (base, Some(network)) => {
@@ -69,13 +70,13 @@ pub(in crate::cuda) fn frozen_parts(frozen: &FrozenHybrid<OnGpu>) -> Result<(Opt
     Ok((frozen.table.as_ref().map(CudaTable::device).transpose()?, frozen.network.as_deref()))
 }
 
-/// Device time of a prediction at points in unit coordinates, in seconds; copies do not count.
+/// Device time of a prediction, in seconds; copies do not count.
 ///
 /// # Errors
 /// The device fails or lacks memory.
-pub(in crate::cuda) fn seconds_of_prediction(frozen: &FrozenHybrid<OnGpu>, points: &[[f32; 3]]) -> Result<f64, DeviceError> {
+pub(in crate::cuda) fn seconds_of_prediction(frozen: &FrozenHybrid<OnGpu>, points: &[UnitPoint]) -> Result<f64, DeviceError> {
     let time = |gpu: &Gpu, by: &dyn DevicePredict| {
-        let points = gpu.upload("points", points)?;
+        let points = gpu.upload::<[f32; 3]>("points", cast_slice(points))?;
         let out = gpu.alloc::<f32>("predictions", points.len())?;
         let begin = gpu.mark()?;
         // SAFETY: both buffers hold as many entries as there are points, and live until the marks are compared, which waits for the stream.
@@ -96,12 +97,12 @@ pub(in crate::cuda) fn seconds_of_prediction(frozen: &FrozenHybrid<OnGpu>, point
 pub(in crate::cuda) fn predict_from_host(
     gpu: &Gpu,
     by: &dyn DevicePredict,
-    points: &[[f32; 3]],
+    points: &[UnitPoint],
     out: &mut [f32],
 ) -> Result<(), DeviceError> {
     let batch = gpu.batch(BATCH, POINT_BYTES);
     for (points, out) in points.chunks(batch).zip(out.chunks_mut(batch)) {
-        let unit = gpu.upload("points to predict at", points)?;
+        let unit = gpu.upload::<[f32; 3]>("points to predict at", cast_slice(points))?;
         let values = gpu.alloc::<f32>("points to predict at", points.len())?;
         // SAFETY: both buffers hold `points.len()` entries, and the read waits for the stream.
         unsafe { by.predict(unit.address(), points.len(), values.address()) }?;

@@ -3,6 +3,7 @@
 use crate::cuda::network::layout::ReadingArgument;
 use crate::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s, unit_box};
 use crate::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
+use bytemuck::cast_slice;
 use cudarc::driver::PushKernelArg;
 use ridgewatch_field::Domain;
 use ridgewatch_surrogate::Samples;
@@ -42,13 +43,13 @@ impl SampleWriter {
     pub(super) fn placed<'a>(&self, samples: &'a Samples, range: Range<usize>) -> (Cow<'a, [[f32; 3]]>, Vec<f32>) {
         let shape = &self.kernels.shape;
         if shape.times().is_empty() {
-            return (Cow::Borrowed(&samples.points[range]), Vec::new());
+            return (Cow::Borrowed(cast_slice(&samples.points[range])), Vec::new());
         }
         let mut further = Vec::new();
         let with_times = |index: usize| {
             let times = placed_times(shape, Some(samples.times_of(index)));
             further.extend(&times[POINT..][..further_places(shape)]);
-            std::array::from_fn(|k| if times[k].is_nan() { samples.points[index][k] } else { times[k] })
+            std::array::from_fn(|k| if times[k].is_nan() { samples.points[index].0[k] } else { times[k] })
         };
         (range.map(with_times).collect(), further)
     }
@@ -58,7 +59,7 @@ impl SampleWriter {
         match self.target() {
             Target::Ftle => Cow::Borrowed(&samples.log_stretch[range]),
             Target::FlowMap => match samples.arrival.get(range.clone()) {
-                Some(arrivals) => Cow::Borrowed(arrivals.as_flattened()),
+                Some(arrivals) => Cow::Borrowed(cast_slice(arrivals)),
                 None => Cow::Owned(vec![f32::NAN; 3 * range.len()]),
             },
         }

@@ -7,9 +7,8 @@ use crate::audit::{AuditFindings, AuditRequest, draws};
 use crate::cuda::driver::pinned::Pinned;
 use crate::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
 use crate::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
-use crate::router::unit_arrival;
 use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_surrogate::Samples;
 use ridgewatch_trust::Audited;
 use std::ops::Range;
@@ -203,11 +202,11 @@ fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &m
     let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
     let missing = back(&memory.missing, 0, count)?;
     let present = || (0..count).filter(|&i| missing[i] == 0);
-    samples.points.extend(present().map(|i| unit[i]));
+    samples.points.extend(present().map(|i| UnitPoint(unit[i])));
     samples.log_stretch.extend(present().map(|i| traced[i]));
     if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
         let arrivals = back(buffer, [0.0; 3], count)?;
-        samples.arrival.extend(present().map(|i| unit_arrival(domain, arrivals[i])));
+        samples.arrival.extend(present().map(|i| domain.to_unit_unclamped(DomainPoint(arrivals[i]))));
     }
     Ok(())
 }

@@ -4,7 +4,7 @@
 
 use super::march::LightArgument;
 use crate::cuda::SUM_PLANES;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_render::rng::philox;
 use ridgewatch_render::smooth::{Correction, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, combine, smoothed};
 use ridgewatch_render::{CameraSettings, Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
@@ -65,7 +65,7 @@ fn uniform(stream: u32) -> impl FnMut() -> f32 {
 /// Structure whose outer bricks along x and z, as the camera sees them first, are empty up to their last nodes.
 fn some_nodes(shape: [usize; 3]) -> Nodes {
     let value = |i: usize| {
-        let ([x, y, z], empty) = (Nodes::unit(shape, i), i % shape[0] >= 24 || i / (shape[0] * shape[1]) >= 16);
+        let (UnitPoint([x, y, z]), empty) = (Nodes::unit(shape, i), i % shape[0] >= 24 || i / (shape[0] * shape[1]) >= 16);
         (9.0 * x + 2.0 * z).sin() * (7.0 * y).cos() + 0.4 * z - if empty { 2.0 } else { 0.0 }
     };
     Nodes::new(shape, Arc::new((0..shape.iter().product()).map(value).collect()))
@@ -92,9 +92,9 @@ fn cell_axes(domain: &Domain) -> [Vec<f64>; 3] {
 }
 
 /// A fifth of the cells is missing.
-fn is_missing(axes: &[Vec<f64>; 3], dimensions: usize, point: [f32; 3]) -> bool {
+fn is_missing(axes: &[Vec<f64>; 3], dimensions: usize, point: DomainPoint) -> bool {
     let (mut index, mut pitch) = (0, 1);
-    for (axis, p) in axes.iter().zip(point).take(dimensions) {
+    for (axis, p) in axes.iter().zip(point.0).take(dimensions) {
         let cells = axis.len() - 1;
         index += pitch * (axis.iter().filter(|node| **node <= f64::from(p)).count().clamp(1, cells) - 1);
         pitch *= cells;
@@ -187,8 +187,8 @@ fn depths_to_the_light_agree() {
     for case in cases() {
         case.with(|renderer, nodes, with_medium| {
             let mut random = uniform(2);
-            let mut points: Vec<[f32; 3]> = (0..3000).map(|_| std::array::from_fn(|_| random())).collect();
-            points.extend((0..8).map(|corner| std::array::from_fn(|k| (corner >> k & 1) as f32)));
+            let mut points: Vec<UnitPoint> = (0..3000).map(|_| UnitPoint(std::array::from_fn(|_| random()))).collect();
+            points.extend((0..8).map(|corner| UnitPoint(std::array::from_fn(|k| (corner >> k & 1) as f32))));
             for refine in [1, 2] {
                 let grid: LightGrid = renderer.light_grid(case.shape, case.values, refine);
                 let mut input = case.input(renderer, nodes, refine);

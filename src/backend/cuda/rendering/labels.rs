@@ -4,9 +4,9 @@
 
 use crate::cuda::layout::LabelsArgument;
 use crate::cuda::{Buffer, DeviceError, Gpu};
-use crate::router::{LabelShare, unit_arrival};
+use crate::router::LabelShare;
 use rayon::prelude::*;
-use ridgewatch_field::Domain;
+use ridgewatch_field::{Domain, DomainPoint};
 use ridgewatch_surrogate::Samples;
 
 /// Limit on the labels of one frame (64 MiB).
@@ -21,14 +21,14 @@ pub(in crate::cuda) const HELD_BACK: u32 = 3;
 struct Label {
     /// Domain coordinates, log-stretch.
     at: [f32; 4],
-    /// Arrival point, domain coordinates; NaN if arrival points are not requested.
-    arrival: [f32; 3],
+    /// Arrival point; NaN if arrival points are not requested.
+    arrival: DomainPoint,
 }
 
 impl Label {
-    fn point(&self) -> [f32; 3] {
+    fn point(&self) -> DomainPoint {
         let [x, y, z, _] = self.at;
-        [x, y, z]
+        DomainPoint([x, y, z])
     }
 }
 
@@ -97,9 +97,9 @@ impl Labels {
         let Some(memory) = &self.memory else { return Ok(()) };
         let mut at = vec![[0.0; 4]; stored.min(memory.at.len())];
         memory.at.read(&mut at)?;
-        let mut arrivals = vec![[f32::NAN; 3]; at.len()];
+        let mut arrivals = vec![DomainPoint([f32::NAN; 3]); at.len()];
         if let Some(buffer) = &memory.arrivals {
-            buffer.read(&mut arrivals)?;
+            buffer.read(bytemuck::cast_slice_mut(&mut arrivals))?;
         }
         self.back.extend(at.into_iter().zip(arrivals).map(|(at, arrival)| Label { at, arrival }));
         self.thin();
@@ -121,7 +121,7 @@ impl Labels {
         Samples {
             points: self.back.par_iter().map(|label| domain.to_unit(label.point())).collect(),
             log_stretch: self.back.iter().map(|label| label.at[3]).collect(),
-            arrival: arrivals.par_iter().map(|label| unit_arrival(domain, label.arrival)).collect(),
+            arrival: arrivals.par_iter().map(|label| domain.to_unit_unclamped(label.arrival)).collect(),
             ..Samples::default()
         }
     }

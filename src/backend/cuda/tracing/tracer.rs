@@ -4,6 +4,8 @@ use crate::BackendError;
 use crate::cuda::layout::Outputs;
 use crate::cuda::tracing::trace::{DeviceTracer, Tuning};
 use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, Gpu, SnapshotStore};
+use bytemuck::{cast_slice, cast_slice_mut};
+use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, FlowMap, MissingCells, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_surrogate::Trace;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -80,9 +82,9 @@ impl CudaTracer {
 }
 
 impl Trace for CudaTracer {
-    fn seconds(&self, seeds: &[[f32; 3]], _: &mut Traced) -> Result<f64, DeviceError> {
+    fn seconds(&self, seeds: &[DomainPoint], _: &mut Traced) -> Result<f64, DeviceError> {
         let gpu = self.device.gpu();
-        let seeds = gpu.upload("seeds", seeds)?;
+        let seeds = gpu.upload::<[f32; 3]>("seeds", cast_slice(seeds))?;
         let [log_stretch, lifetime_share] = [gpu.alloc::<f32>("results", seeds.len())?, gpu.alloc::<f32>("results", seeds.len())?];
         let double = self.double.then(|| gpu.alloc::<f64>("results", seeds.len())).transpose()?;
         let out = Outputs {
@@ -101,7 +103,7 @@ impl Trace for CudaTracer {
         &*self.host
     }
 
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+    fn trace(&self, seeds: &[DomainPoint], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         out.set_len(seeds.len(), extras, self.double);
         let gpu = self.device.gpu();
         let mut room = self.room.lock().unwrap_or_else(PoisonError::into_inner);
@@ -127,7 +129,7 @@ impl Trace for CudaTracer {
         let Some(room) = room.as_mut() else { return Ok(()) };
         for start in (0..seeds.len()).step_by(room.capacity) {
             let part = start..(start + room.capacity).min(seeds.len());
-            room.seeds.write(&seeds[part.clone()])?;
+            room.seeds.write(cast_slice(&seeds[part.clone()]))?;
             let arrival = room.arrival.as_ref().filter(|_| extras.arrival);
             let jacobian = room.jacobian.as_ref().filter(|_| extras.jacobian);
             let addresses = Outputs {
@@ -145,7 +147,7 @@ impl Trace for CudaTracer {
                 buffer.read(&mut out.log_stretch_f64[part.clone()])?;
             }
             if let Some(buffer) = arrival {
-                buffer.read(&mut out.arrival[part.clone()])?;
+                buffer.read(cast_slice_mut(&mut out.arrival[part.clone()]))?;
             }
             if let Some(buffer) = jacobian {
                 buffer.read(&mut out.jacobian[part])?;
