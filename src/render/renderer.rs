@@ -210,12 +210,14 @@ impl Renderer {
         }
     }
 
-    /// Linear radiance in the middle of the picture if the whole box has one FTLE (1/time): what a colour bar shows. That of the background if the ray
-    /// through the middle misses the box.
+    /// Linear radiance of the middle of the box, in the direction of the view, if the whole box has one FTLE (1/time): what a colour bar shows.
     pub fn uniform_color(&self, ftle: f32) -> [f32; 3] {
         const SLICES: usize = 256;
         let background = self.scene.settings.background.map(|c| c as f32);
-        let (eye, toward) = self.camera.ray(0.0, 0.0);
+        // Whatever part of the box the view shows.
+        let (_, toward) = self.camera.ray(0.0, 0.0);
+        let (centre, edges) = (self.space.centre(), self.space.edges());
+        let eye = std::array::from_fn(|k| centre[k] - edges.iter().sum::<f64>() * toward[k]);
         let Some((enter, leave)) = self.space.intersect(eye, toward) else { return background };
         let (extinction, albedo) = (self.transfer.extinction(ftle), self.transfer.albedo(ftle));
         let slice = (leave - enter) / SLICES as f64;

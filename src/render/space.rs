@@ -84,6 +84,11 @@ impl SceneBox {
         std::array::from_fn(|k| self.max[k] - self.min[k])
     }
 
+    /// Middle of the box in scene units.
+    pub fn centre(&self) -> [f64; 3] {
+        std::array::from_fn(|k| 0.5 * (self.min[k] + self.max[k]))
+    }
+
     /// Unit coordinates of grid coordinates.
     #[inline]
     pub fn unit_of_grid(&self, grid: GridPoint) -> UnitPoint {

@@ -44,10 +44,10 @@ impl Transfer {
             let key = if settings.low.is_none() { "transfer.low" } else { "transfer.high" };
             return Err(RenderError::Invalid { key, found: "not set".into(), accepted: number });
         };
-        require(low.is_finite(), "transfer.low", low, "a finite number")?;
+        require((low as f32).is_finite(), "transfer.low", low, "a finite number")?;
         let range = (high - low) as f32;
         require(
-            high.is_finite() && high > low && range > 0.0 && (1.0 / range).is_finite(),
+            (high as f32).is_finite() && high > low && range > 0.0 && range.is_finite() && (1.0 / range).is_finite(),
             "transfer.high",
             high,
             "a finite number above transfer.low",

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 /// Colours of a bar.
 const COLORS: usize = 32;
 
-/// Colours in the middle of the picture if the whole box has one FTLE, in 8 bits, tone-mapped as the picture is. Where the FTLE varies, shadow and depth
+/// Colours in the middle of the box if the whole box has one FTLE, in 8 bits, tone-mapped as the picture is. Where the FTLE varies, shadow and depth
 /// change them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ColorBar {

@@ -112,7 +112,7 @@ const COARSE_IN_TIME: f64 = 0.25;
 /// Frames that refine a window that stands still, after each command.
 const FRAMES_WHILE_PAUSED: usize = 32;
 /// Interval at which a run that waits for a command looks for the end, and for the simulation.
-const GLANCE: Duration = Duration::from_millis(20);
+const GLANCE: Duration = Duration::from_millis(2);
 /// Maximum number of residuals of rendered samples that go to the trust map each frame. More would not improve the estimates of their cells.
 pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
 
@@ -188,6 +188,8 @@ pub(super) struct RunProgress {
     pub(super) checkpoint_pause: f64,
     /// Commands that took effect since the last frame.
     pub(super) commands: Vec<Command>,
+    /// Seconds that the run waited for a step and looked for commands, since the last frame.
+    pub(super) waited: f64,
 }
 
 impl RunProgress {
@@ -222,6 +224,16 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) map: FlowMap,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
     settled: Option<(StepChoice, PictureSteps)>,
+}
+
+/// What commands changed since the last frame, by what follows from it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Commands {
+    None,
+    /// The camera, or whether the window stands still.
+    View,
+    /// The ramp or the tolerance too, by which steps are chosen.
+    Colours,
 }
 
 /// Place of a frame in its slide.
@@ -316,6 +328,7 @@ fn drive<B: Backend>(
     slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen));
     cycle.settle_steps(&slide, chosen)?;
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
+    cycle.run.end_commands();
     // The checkpoint is written even if the run was stopped.
     match ended {
         Err(RunEnd::Failed(error)) => Err(RunEnd::Failed(error)),
@@ -421,10 +434,10 @@ impl<B: Backend> Cycle<'_, B> {
     /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer.
     fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
         let shown = self.run.shown();
-        let Some(chosen) = chosen.filter(|choice| choice.within_tolerance && suit_the_picture(shown.plan)) else { return Ok(()) };
+        let Some(chosen) = chosen.filter(|_| suit_the_picture(shown.plan)) else { return Ok(()) };
         let settled = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
-        self.settled = settled.map(|settled| (chosen, settled));
-        if let Some(settled) = settled.filter(|settled| settled.steps < chosen.steps) {
+        self.settled = Some((chosen, settled));
+        if settled.steps < chosen.steps {
             tracing::info!("{settled:?} instead of {chosen:?}");
             self.take_steps(chosen, Some(settled));
             transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
@@ -432,25 +445,44 @@ impl<B: Backend> Cycle<'_, B> {
         Ok(())
     }
 
-    /// Chooses the steps anew if they do not suit the picture of this slide.
-    fn look_at_steps(&mut self, slide: &Slide) -> Result<(), RunEnd> {
-        let Some((chosen, settled)) = self.settled else { return Ok(()) };
+    /// Chooses the steps anew if they do not suit the picture of this slide. Returns whether the flow map is another one.
+    fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
+        let Some((chosen, settled)) = self.settled else { return Ok(false) };
         let (shown, begin) = (self.run.shown(), Instant::now());
         let anew = self.run.threads.render().install(|| {
             if !is_outdated(shown, slide, chosen, settled)? {
                 return Ok(None);
             }
-            let Some(anew) = cpu_tracer(slide.velocity.clone(), &shown.plan.map, slide.time)?.step_choice() else { return Ok(None) };
-            let settled = picture_steps(shown, slide, anew)?;
-            Ok::<_, FlowError>(settled.map(|settled| (anew, settled)))
+            match cpu_tracer(slide.velocity.clone(), &shown.plan.map, slide.time) {
+                Ok(tracer) => {
+                    let anew = tracer.step_choice().unwrap_or(chosen);
+                    Ok(Some(Ok((anew, picture_steps(shown, slide, anew)?))))
+                }
+                // The run goes on with what it has.
+                Err(error @ FlowError::StepsNotFound { .. }) => Ok(Some(Err(error))),
+                Err(error) => Err(RunEnd::from(error)),
+            }
         })?;
         tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
-        if let Some((chosen, settled)) = anew {
-            tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
-            self.settled = Some((chosen, settled));
-            self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps && chosen.within_tolerance));
+        let (chosen, settled) = match anew {
+            None => return Ok(false),
+            Some(Ok(anew)) => anew,
+            Some(Err(error)) => {
+                self.run.progress.warnings.push(format!("slide {}: {error}; the picture keeps {} steps", slide.index, settled.steps));
+                return Ok(false);
+            }
+        };
+        if !chosen.within_tolerance {
+            self.run.progress.warnings.push(format!(
+                "slide {}: the log-stretch with {} steps differs by {:.3} from that with twice as many",
+                slide.index, chosen.steps, chosen.difference
+            ));
         }
-        Ok(())
+        tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
+        let before = self.map.steps.clone();
+        self.settled = Some((chosen, settled));
+        self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
+        Ok(self.map.steps != before)
     }
 
     /// Takes the steps of the picture, or else those of the log-stretch.
@@ -478,6 +510,7 @@ impl<B: Backend> Cycle<'_, B> {
             check_stop(self.run.stop)?;
             let Some(next) = next else { return Ok(()) };
             (slide, begun) = (next, Instant::now());
+            slide.waited += std::mem::take(&mut self.run.progress.waited);
             self.begin_slide(&slide)?;
             slide.warnings.extend(self.run.beyond_the_range(slide.time));
             transaction!(self, &slide, run, on => run.probe(on, slide.index));
@@ -526,6 +559,14 @@ impl<B: Backend> Cycle<'_, B> {
     /// (unless the network has the start time as an input).
     fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         self.look_at_steps(slide)?;
+        self.trace_anew(slide)?;
+        let Run { renderer, threads, .. } = &mut self.run;
+        threads.render().install(|| renderer.window_slid());
+        Ok(())
+    }
+
+    /// Makes the flow map of a slide, and all that was traced by the one before.
+    fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
         let rebuilds = self.run.learning.resize.is_some();
@@ -534,8 +575,6 @@ impl<B: Backend> Cycle<'_, B> {
         if with!(&self.session, on => on.surrogate.is_some()) {
             transaction!(self, slide, run, on => run.slide_labels(on));
         }
-        let Run { renderer, threads, .. } = &mut self.run;
-        threads.render().install(|| renderer.window_slid());
         Ok(())
     }
 
@@ -546,11 +585,22 @@ impl<B: Backend> Cycle<'_, B> {
         let target = self.run.plan.scene.render.until;
         let planned = warmups + time.frames_per_slide;
         let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
-        let (mut number, mut since_command) = (0, 0);
+        let (mut number, mut since_command) = (0, None);
         loop {
-            if self.run.apply_commands() {
-                since_command = 0;
+            let commands = self.run.apply_commands();
+            if commands > Commands::None {
+                since_command = Some(0);
             }
+            if commands == Commands::Colours && self.look_at_steps(slide)? {
+                with!(&mut self.session, on => {
+                    on.tracer = None;
+                    on.picture = Default::default();
+                });
+                self.trace_anew(slide)?;
+                self.run.learning.trust.reset();
+                transaction!(self, slide, run, on => run.probe(on, slide.index));
+            }
+            slide.waited += std::mem::take(&mut self.run.progress.waited);
             let place =
                 FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
             if self.run.learning.resize.is_some() {
@@ -575,24 +625,28 @@ impl<B: Backend> Cycle<'_, B> {
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
             number += 1;
-            since_command += 1;
+            since_command = since_command.map(|frames: usize| frames + 1);
             if self.run.is_paused() {
-                if is_done || since_command >= FRAMES_WHILE_PAUSED {
+                if is_done || since_command.is_none_or(|frames| frames >= FRAMES_WHILE_PAUSED) {
                     while !self.run.is_commanded_within(GLANCE) {
                         self.run.check_end()?;
+                        transaction!(self, slide, run, on => run.checkpoint_if_due(on));
                     }
                 }
                 continue;
             }
             let is_due = number >= planned && slides.is_awaited() == Some(false);
-            if !is_done && !is_due && number < most {
+            // A new view that comes while a simulation's next step is awaited gets as many frames as a slide.
+            let is_new = slides.is_awaited() == Some(true) && since_command.is_some_and(|frames| frames < planned);
+            if !is_done && !is_due && (number < most || is_new) {
                 continue;
             }
-            if let Some(target) = target.filter(|_| !is_done) {
+            if let Some(target) = target.filter(|_| !is_done && number <= most) {
                 let why = if is_due { "the next window is complete" } else { "no slide gets more frames" };
                 self.run.progress.warnings.push(format!("slide {}: the stated error is not yet below {target}, but {why}", slide.index));
             }
-            transaction!(self, slide, run, on => run.train_meanwhile(on, slides, begun.elapsed().as_secs_f64()));
+            let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
+            transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
             if !self.is_commanded_meanwhile(slides)? {
                 return Ok(());
             }
@@ -600,17 +654,18 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// Whether a command comes while a simulation's next window is incomplete: the slide then gets another frame.
-    fn is_commanded_meanwhile(&self, slides: &dyn Slides) -> Result<bool, RunEnd> {
-        if self.run.options.steering.is_none() {
+    fn is_commanded_meanwhile(&mut self, slides: &dyn Slides) -> Result<bool, RunEnd> {
+        if self.run.options.steering.is_none() || slides.is_over() {
             return Ok(false);
         }
-        while slides.is_awaited() == Some(true) {
-            if self.run.is_commanded_within(GLANCE) {
-                return Ok(true);
-            }
+        let begin = Instant::now();
+        let mut is_commanded = false;
+        while !is_commanded && slides.is_awaited() == Some(true) {
+            is_commanded = self.run.is_commanded_within(GLANCE);
             self.run.check_end()?;
         }
-        Ok(false)
+        self.run.progress.waited += begin.elapsed().as_secs_f64();
+        Ok(is_commanded)
     }
 
     fn finish(&mut self) -> Result<(), RunError> {
@@ -637,7 +692,7 @@ impl<B: Backend> Cycle<'_, B> {
 
 impl Run<'_> {
     fn shown(&self) -> Shown<'_> {
-        Shown { plan: self.plan, transfer: self.renderer.transfer(), tolerance: self.learning.trust.tolerance() }
+        Shown { plan: self.plan, transfer: self.renderer.transfer(), tolerance: self.learning.trust.tolerance(), stop: self.stop }
     }
 
     /// Ends the run if that was asked for, or its time is up.
@@ -653,23 +708,33 @@ impl Run<'_> {
     }
 
     /// Whether a command waits, or one comes within `limit`.
-    fn is_commanded_within(&self, limit: Duration) -> bool {
+    pub(super) fn is_commanded_within(&self, limit: Duration) -> bool {
         self.options.steering.as_ref().is_some_and(|steering| steering.is_pending_within(limit))
     }
 
-    /// Applies the commands that came since the last frame. Returns whether there were any. A picture that accumulates notices what it no longer
-    /// shows, and starts anew.
-    fn apply_commands(&mut self) -> bool {
-        let Some(steering) = &self.options.steering else { return false };
-        let commands = steering.take();
-        let is_commanded = !commands.is_empty();
-        for command in commands {
+    /// Applies the commands that came since the last frame, and returns what they changed. A picture that accumulates notices what it no longer shows,
+    /// and starts anew.
+    fn apply_commands(&mut self) -> Commands {
+        let Some(steering) = &self.options.steering else { return Commands::None };
+        let mut changed = Commands::None;
+        for command in steering.take() {
+            let is_view = command.set.range.is_none() && command.set.tolerance.is_none();
+            changed = changed.max(if is_view { Commands::View } else { Commands::Colours });
             match self.apply(&command) {
                 Ok(()) => self.progress.commands.push(command),
                 Err(refused) => self.progress.warnings.push(format!("command {} had no effect: {refused}", command.number)),
             }
         }
-        is_commanded
+        changed
+    }
+
+    /// Takes no more commands. Those that were accepted too late are told.
+    fn end_commands(&mut self) {
+        let late = self.options.steering.as_ref().map(|steering| steering.end()).unwrap_or_default();
+        if let (Some(first), Some(last)) = (late.first(), late.last()) {
+            let numbers = format!("{} to {}", first.number, last.number);
+            self.progress.warnings.push(format!("commands {numbers} came after the last frame began and had no effect"));
+        }
     }
 
     fn apply(&mut self, Command { set, .. }: &Command) -> Result<(), RenderError> {

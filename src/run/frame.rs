@@ -285,7 +285,7 @@ impl Run<'_> {
         };
         let begin = Instant::now();
         let (mut trained, mut was_idle) = (0.0, false);
-        while trained < settings.seconds() && !self.stop.load(Ordering::Relaxed) {
+        while trained < settings.seconds() && !self.stop.load(Ordering::Relaxed) && !self.is_commanded_within(Duration::ZERO) {
             let mut slice = (settings.seconds() - trained).min(TURN);
             if surrogate.trains_on_device() {
                 match self.learning.budget.due(self.began.elapsed().as_secs_f64()) {

@@ -55,6 +55,11 @@ pub trait Slides: Send {
     fn is_awaited(&self) -> Option<bool> {
         None
     }
+
+    /// Whether no further slide is given, whatever the source does.
+    fn is_over(&self) -> bool {
+        false
+    }
 }
 
 /// Counts slides up to a limit.
@@ -222,6 +227,10 @@ impl Slides for LiveSlides {
 
     fn is_awaited(&self) -> Option<bool> {
         Some(self.window.is_waited_for())
+    }
+
+    fn is_over(&self) -> bool {
+        self.count.is_over()
     }
 }
 

@@ -89,6 +89,8 @@ pub struct Steering {
 struct State {
     commands: u64,
     paused: bool,
+    /// The run makes no further frame.
+    ended: bool,
     /// For the next frame.
     pending: Vec<Command>,
 }
@@ -117,6 +119,9 @@ impl Steering {
     pub fn command(&self, set: &Map<String, Value>) -> Result<SteeringState, Refused> {
         let change = self.check(set)?;
         let mut state = self.lock();
+        if state.ended {
+            return Err(Refused::new("command", "comes after the last frame", "commands while the run makes frames"));
+        }
         if !change.is_empty() {
             state.commands += 1;
             state.paused = change.paused.unwrap_or(state.paused);
@@ -168,6 +173,13 @@ impl Steering {
     /// The commands since the last call.
     pub(super) fn take(&self) -> Vec<Command> {
         std::mem::take(&mut self.lock().pending)
+    }
+
+    /// Refuses what comes from now on, and returns the commands that no frame has shown.
+    pub(super) fn end(&self) -> Vec<Command> {
+        let mut state = self.lock();
+        state.ended = true;
+        std::mem::take(&mut state.pending)
     }
 
     pub(super) fn is_paused(&self) -> bool {
@@ -271,5 +283,8 @@ mod tests {
             (2, 1001, &Some(steering.home.clone()), Some(false))
         );
         assert!(!steering.is_pending_within(Duration::from_millis(1)));
+        command(&steering, json!({"paused": true})).unwrap();
+        assert_eq!(steering.end().len(), 1, "no frame has shown it");
+        assert!(command(&steering, json!({"paused": true})).unwrap_err().contains("comes after the last frame"));
     }
 }

@@ -2,12 +2,15 @@
 
 use super::setup::Plan;
 use super::slides::Slide;
+use super::stop::{RunEnd, check_stop};
 use crate::backend::stratified_points;
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
+use crate::progress;
 use crate::render::Transfer;
 use crate::trust::Strata;
 use std::ops::RangeInclusive;
+use std::sync::atomic::AtomicBool;
 
 /// Largest optical residual of the steps, as a part of `trust.tolerance`, in flows of three dimensions, whose errors average along a ray: pictures of
 /// turbulence differ by 57 dB then (`docs/accuracy.md`).
@@ -29,6 +32,7 @@ pub(super) struct Shown<'a> {
     pub(super) transfer: &'a Transfer,
     /// Allowed optical residual of the picture.
     pub(super) tolerance: f64,
+    pub(super) stop: &'a AtomicBool,
 }
 
 impl Shown<'_> {
@@ -49,35 +53,39 @@ pub(super) struct PictureSteps {
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
-/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance, or those `chosen` for the log-stretch if it has none below them. `None` if too few points show anything
-/// to judge by.
+/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance, or those `chosen` for the log-stretch if it has none below them, if these are not within their own
+/// tolerance, or if too few points show anything to judge by.
 ///
 /// # Errors
-/// As for [`cpu_tracer`].
-pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<Option<PictureSteps>, FlowError> {
+/// As for [`cpu_tracer`], or a stop is requested.
+pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<PictureSteps, RunEnd> {
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
-    let Some(comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else { return Ok(None) };
-    let mut multiple = 1;
+    let Some(comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
+        return Ok(PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 });
+    };
+    let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
         let found = comparison.of(multiple * chosen.multiple_of)?;
         if found.residual <= shown.most() {
-            return Ok(Some(found));
+            return Ok(found);
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
     }
-    comparison.of(chosen.steps).map(Some)
+    comparison.of(chosen.steps)
 }
 
-/// Whether steps that were `settled` for an earlier slide suit the picture of this one no more: its flow may be faster, or calmer. `chosen` was the
-/// choice for the log-stretch.
+/// Whether steps that were `settled` for an earlier slide suit the picture of this one no more: its flow, its colours or its tolerance may be others.
+/// `chosen` was the choice for the log-stretch.
 ///
 /// # Errors
-/// As for [`cpu_tracer`].
-pub(super) fn is_outdated(shown: Shown<'_>, slide: &Slide, chosen: StepChoice, settled: PictureSteps) -> Result<bool, FlowError> {
+/// As for [`picture_steps`].
+pub(super) fn is_outdated(shown: Shown<'_>, slide: &Slide, chosen: StepChoice, settled: PictureSteps) -> Result<bool, RunEnd> {
     // A quarter of the points of a choice, and others on each slide.
     let cells = if shown.plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
     let Some(comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok(false) };
-    let share = comparison.of(settled.steps)?.residual / shown.most().max(settled.residual);
+    // Where the choice had no more steps to give, their residual may be larger.
+    let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };
+    let share = comparison.of(settled.steps)?.residual / most;
     let is_least = settled.steps <= chosen.multiple_of;
     Ok(share > *AGAIN.end() || share < *AGAIN.start() && !is_least)
 }
@@ -98,7 +106,7 @@ struct Comparison<'a> {
 
 impl<'a> Comparison<'a> {
     /// One point in each of the `cells` of the domain. `None` if too few of them show anything.
-    fn new(shown: Shown<'a>, slide: &'a Slide, cells: [usize; 3], number: u64, steps: usize) -> Result<Option<Self>, FlowError> {
+    fn new(shown: Shown<'a>, slide: &'a Slide, cells: [usize; 3], number: u64, steps: usize) -> Result<Option<Self>, RunEnd> {
         // Not the seed of the picture, which would change the flow map.
         let unit = stratified_points(&Strata::even(cells, 1), number, STREAM);
         let points = unit.into_iter().map(|unit| shown.plan.domain.from_unit(unit)).collect();
@@ -121,7 +129,9 @@ impl<'a> Comparison<'a> {
         f64::from(self.shown.transfer.ramp(log_stretch / self.shown.plan.map.tau as f32))
     }
 
-    fn of(&self, steps: usize) -> Result<PictureSteps, FlowError> {
+    fn of(&self, steps: usize) -> Result<PictureSteps, RunEnd> {
+        check_stop(self.shown.stop)?;
+        progress::mark();
         let mut traced = Traced::default();
         self.tracer(steps)?.trace(&self.points, Extras::default(), &mut traced);
         let pairs = || traced.log_stretch.iter().copied().zip(self.truth.log_stretch.iter().copied());

@@ -101,6 +101,9 @@ impl TrustMap {
 
     /// Changes the allowed optical residual. What was measured stays; the evidence against the gate begins anew.
     pub fn set_tolerance(&mut self, tolerance: f64) {
+        if tolerance == self.settings.tolerance {
+            return;
+        }
         self.settings.tolerance = tolerance;
         self.evidence = GateEvidence::new(tolerance);
     }

@@ -2,15 +2,16 @@
 
 use crate::kit::ring::{Ring, grid, publish};
 use crate::kit::scene::parse;
-use ridgewatch::run::{Event, RunOptions, Setup, Steering, run};
+use ridgewatch::run::{Event, FrameRecord, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::source::live::Live;
 use ridgewatch_wire::{Policy, Producer};
 use serde_json::json;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::sync::mpsc::channel;
-use std::time::Duration;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 const SCENE: &str = "
     source.kind = \"live\"
@@ -36,13 +37,15 @@ fn simulate(producer: &Producer, steps: std::ops::Range<u64>) {
     }
 }
 
-#[test]
-fn a_command_gets_a_frame_while_the_simulation_is_awaited() {
-    let ring = Ring::new("steering");
+/// A run of this many slides, with its producer and the commands to it.
+type Following = (Producer, Arc<Steering>, Receiver<Arc<FrameRecord>>, JoinHandle<RunReport>, Ring);
+
+fn follow(name: &str, keys: &[&str]) -> Following {
+    let ring = Ring::new(name);
     let producer = Producer::open(&ring.0, grid(&[16, 16]), 8, Policy::NewestWins).unwrap();
     simulate(&producer, 0..4);
     let key = format!("live.ring=\"{}\"", Path::new(&ring.0).display());
-    let scene = parse(SCENE, &[&key]).unwrap();
+    let scene = parse(SCENE, &[keys, &[&key]].concat()).unwrap();
     let live = Live::connect(&scene.live, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
     let setup = Setup::live(scene.settings(), live).unwrap();
     let steering = Arc::new(Steering::new(&setup.plan));
@@ -56,6 +59,42 @@ fn a_command_gets_a_frame_while_the_simulation_is_awaited() {
         };
         run(setup, &options, &mut sink, &AtomicBool::new(false)).unwrap()
     });
+    (producer, steering, frames, running, ring)
+}
+
+/// The simulation goes on, and nothing more is wanted of it.
+#[test]
+fn a_run_of_so_many_slides_ends_with_the_last_one() {
+    let (producer, _steering, frames, running, _ring) = follow("steering-ends", &["time.slides=1"]);
+    assert_eq!(frames.recv_timeout(Duration::from_secs(60)).unwrap().slide, 0);
+    // Until it ends the channel is open.
+    assert_eq!(frames.recv_timeout(Duration::from_secs(60)).unwrap_err(), RecvTimeoutError::Disconnected);
+    assert_eq!(running.join().unwrap().slides, 1);
+    drop(producer);
+}
+
+/// Training between two steps would go on for a minute.
+#[test]
+fn a_command_interrupts_the_training_between_two_steps() {
+    let keys =
+        ["surrogate.kind=network", "render.method=gated", "training.seconds_per_frame=60", "network.width=16", "network.log2_table=8"];
+    let (producer, steering, frames, running, _ring) = follow("steering-trains", &keys);
+    let next = || frames.recv_timeout(Duration::from_secs(120)).unwrap();
+    next();
+    std::thread::sleep(Duration::from_millis(500));
+    let begin = Instant::now();
+    steering.command(json!({"trust.tolerance": 0.2}).as_object().unwrap()).unwrap();
+    assert_eq!(next().commands.len(), 1);
+    assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
+    drop(producer);
+    drop(frames);
+    // The channel is closed, so that a further frame ends the thread.
+    let _ = running.join();
+}
+
+#[test]
+fn a_command_gets_a_frame_while_the_simulation_is_awaited() {
+    let (producer, steering, frames, running, _ring) = follow("steering", &[]);
     let next = || frames.recv_timeout(Duration::from_secs(60)).unwrap();
     let command = |set: serde_json::Value| {
         steering.command(set.as_object().unwrap()).unwrap();
@@ -77,6 +116,14 @@ fn a_command_gets_a_frame_while_the_simulation_is_awaited() {
     let record = next();
     assert!(record.slide <= 2);
     let paused = record.slide;
+    while let Ok(record) = frames.recv_timeout(Duration::from_millis(500)) {
+        assert_eq!(record.slide, paused);
+    }
+    if paused < 2 {
+        // The step of the next window is there.
+        simulate(&producer, 6..7);
+        assert!(frames.recv_timeout(Duration::from_millis(500)).is_err(), "the window stands still");
+    }
     command(json!({"paused": false}));
     let last = loop {
         let record = next();

@@ -68,6 +68,59 @@ fn a_command_is_in_effect_and_in_the_record_of_the_next_frame() {
     }
 }
 
+/// A finer tolerance, and a steeper ramp, show an error of the integration that the former ones did not.
+#[test]
+fn the_steps_of_the_integration_follow_tolerance_and_colours() {
+    let keys = "time.tau = 10\ntime.frames_per_slide = 6\nsurrogate.kind = \"table\"\nrender.method = \"marched\"\ntrust.tolerance = 0.5\n";
+    let (frames, report) = steered(setup(&double_gyre([48, 24, 1], keys), &[]), |steering, frame| {
+        match frame.record.frame {
+            1 => command(steering, json!({"trust.tolerance": 0.05})),
+            3 => command(steering, json!({"transfer": {"low": 0.2, "high": 0.201}})),
+            _ => {}
+        }
+        false
+    });
+    let steps: Vec<u64> = frames.iter().map(|frame| frame.record.integration_steps.unwrap()).collect();
+    assert!(
+        steps[0] == steps[1] && steps[2] > steps[1] && steps[3] == steps[2] && steps[4] > steps[3] && steps[5] == steps[4],
+        "{steps:?}"
+    );
+    assert_eq!(report.integration_steps, Some(steps[5] as usize));
+    for (number, tolerance) in [(0, 0.5), (2, 0.05)] {
+        let residual = frames[number].record.integration_residual.unwrap();
+        assert!(residual <= tolerance / 15.0, "frame {number}: {residual}");
+    }
+}
+
+#[test]
+fn what_comes_too_late_is_told() {
+    let (frames, report) = steered(scene("render.method = \"reference\"\n"), |steering, _| {
+        command(steering, json!({"trust.tolerance": 0.25}));
+        false
+    });
+    assert!(frames.len() == 1 && frames[0].record.commands.is_empty());
+    let told = report.warnings.iter().any(|warning| warning.contains("commands 1 to 1 came after the last frame began and had no effect"));
+    assert!(told, "{:?}", report.warnings);
+}
+
+/// The bar is that of the box, not of what happens to be in the middle of the picture.
+#[test]
+fn a_view_past_the_box_keeps_the_colours_of_its_bar() {
+    let aside = r#"{"eye": [4.0, 0.25, 1.0], "look_at": [4.0, 0.25, 0.1], "up": [0, 1, 0], "field_of_view": 60, "orthographic": true}"#;
+    let (frames, _) = steered(scene("time.frames_per_slide = 2\nrender.method = \"reference\"\n"), |steering, frame| {
+        if frame.record.frame == 0 {
+            command(steering, json!({"camera": serde_json::from_str::<Value>(aside).unwrap()}));
+        }
+        false
+    });
+    let different = |frame: &Frame| {
+        let mut colours = frame.color_bar.as_ref().unwrap().colors.clone();
+        colours.dedup();
+        colours.len()
+    };
+    assert!(different(&frames[0]) > 8 && different(&frames[1]) > 8, "{} and {} colours", different(&frames[0]), different(&frames[1]));
+}
+
 /// As many samples as if the picture had begun with that camera: nothing of the former view is left in it.
 #[test]
 fn an_accumulating_picture_starts_anew_with_another_camera() {
