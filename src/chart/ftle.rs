@@ -1,7 +1,7 @@
 //! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
 
-use super::picture::with_method;
 use super::slides::FirstSlides;
+use super::with_method;
 use super::{Charting, device_name, failed};
 use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]

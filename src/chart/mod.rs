@@ -11,6 +11,7 @@ mod ftle;
 mod picture;
 mod scaling;
 mod slides;
+mod still;
 mod table;
 mod train;
 mod trial;
@@ -19,8 +20,9 @@ mod verdict;
 pub use draw::{DrawError, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{FtlePanel, FtlePoint};
-pub use picture::{Auto, PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, fixed_colours, picture_errors};
+pub use picture::{Auto, PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};
 pub use scaling::{ScalingPanel, ScalingPoint};
+pub use still::fixed_colours;
 pub use table::csv;
 pub use train::{Epoch, TrainOptions, TrainReport, train};
 pub use trial::{Choice, TRIAL_SECONDS, choose};
@@ -29,7 +31,9 @@ pub use verdict::verdict;
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend as _, BackendError, Cpu, Device};
+use crate::render::Method;
 use crate::run::{RunError, Settings};
+use crate::surrogate::Kind;
 use serde::Serialize;
 use slides::FirstSlides;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -195,4 +199,21 @@ pub fn chart(
         not_measured: charting.not_measured,
         seconds: began.elapsed().as_secs_f64(),
     })
+}
+
+/// The scene with another method, and a number of samples that the method accepts.
+fn with_method(settings: &Settings, method: Method, kind: Kind) -> Settings {
+    let mut settings = settings.clone();
+    (settings.render.method, settings.render.until, settings.render.budget) = (method, None, None);
+    if !method.is_smooth() {
+        settings.render.samples = settings.render.samples.ceil().max(1.0);
+    }
+    if kind != settings.surrogate.kind {
+        (settings.surrogate.kind, settings.surrogate.table_nodes) = (kind, None);
+    }
+    if kind != Kind::Network {
+        (settings.network.inputs, settings.network.start_range) = (Vec::new(), None);
+    }
+    settings.training.resume = None;
+    settings
 }

@@ -1,6 +1,6 @@
 //! Slides that are read once and shown to many runs, each of which still opens the source.
 
-use super::picture::with_method;
+use super::with_method;
 use crate::flow::VelocitySource;
 use crate::render::Method;
 use crate::run::{RunError, Settings, Setup, Slide, Slides, TimeSpan};

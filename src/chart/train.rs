@@ -2,8 +2,8 @@
 
 use super::failed;
 use super::ftle::{Opened, Points};
-use super::picture::colours_of;
 use super::slides::FirstSlides;
+use super::still::colours_of;
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};

@@ -1,8 +1,9 @@
 //! A short trial of methods on a scene: the choice of `method = "auto"`.
 
 use super::device_name;
-use super::picture::{colours_of, compile, noise_psnr, still, with_method};
 use super::slides::FirstSlides;
+use super::still::{colours_of, compile, noise_psnr, still};
+use super::with_method;
 use crate::backend::Device;
 use crate::render::{Film, Method};
 use crate::run::{RunError, RunOptions, Settings};

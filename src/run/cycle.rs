@@ -479,7 +479,7 @@ impl<B: Backend> Cycle<'_, B> {
             ));
         }
         tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
-        let before = self.map.steps.clone();
+        let before = self.map.steps;
         self.settled = Some((chosen, settled));
         self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
         Ok(self.map.steps != before)

@@ -5,7 +5,7 @@
 //! the fields agree. This is a two-level estimator (Giles 2015) with delta and ratio tracking (see [`crate::render`]) as the path sampler. Each
 //! field has weights of its own where its extinction exceeds the majorant, so that the estimate stays unbiased.
 
-use super::march::{IsMissing, Medium};
+use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use crate::rng::unit;
 use crate::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};

@@ -5,7 +5,7 @@
 //! neighbouring columns are in the box for different lengths; so the extinction is continued outside, and what lies before the wall is subtracted.
 //! For a point light each node of a plain grid is marched by itself.
 
-use super::march::{Medium, node_spacing};
+use super::medium::{Medium, node_spacing};
 use crate::Light;
 use rayon::prelude::*;
 use ridgewatch_field::UnitPoint;

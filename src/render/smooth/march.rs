@@ -5,32 +5,16 @@
 //! in two dimensions (Roberts 2018), which fills the pixel evenly.
 
 use super::light_volume::LightVolume;
-use super::nodes::Nodes;
+use super::medium::{MAX_POINTS, Medium};
+use crate::Light;
 use crate::rng::unit;
-use crate::tracking::{FrameScene, PHASE};
-use crate::{GridPoint, Light};
-use ridgewatch_field::{DomainPoint, UnitPoint};
+use crate::tracking::PHASE;
+use ridgewatch_field::UnitPoint;
 
 /// Transmittance below which the rest of a ray is not marched.
 const OPAQUE: f32 = 1e-4;
-/// Largest number of quadrature points on a ray.
-const MAX_POINTS: f32 = 65_536.0;
 /// Third counter word of the random shift of a pixel's rays, which no path reaches.
 const SHIFT_DIMENSION: u32 = u32::MAX - 1;
-
-/// Whether a point lies in a missing cell.
-pub type IsMissing<'a> = &'a (dyn Fn(DomainPoint) -> bool + Sync);
-
-/// What is marched through.
-#[derive(Clone, Copy)]
-pub struct Medium<'a> {
-    /// Camera, light, transfer function and box.
-    pub scene: &'a FrameScene<'a>,
-    /// Log-stretch on nodes.
-    pub nodes: &'a Nodes,
-    /// `None`: every cell has data.
-    pub missing: Option<IsMissing<'a>>,
-}
 
 /// How the transmittance to the light is found.
 #[derive(Clone, Copy)]
@@ -80,44 +64,7 @@ fn offsets(j: u64) -> [f32; 3] {
     [x, y, 0.5]
 }
 
-/// Smallest distance between nodes, in scene units.
-pub fn node_spacing(edges: [f64; 3], shape: [usize; 3]) -> f64 {
-    (0..3).filter(|&k| shape[k] > 1).map(|k| edges[k] / (shape[k] - 1) as f64).fold(f64::INFINITY, f64::min)
-}
-
 impl Medium<'_> {
-    /// Smallest distance between nodes, in scene units.
-    pub fn spacing(&self) -> f64 {
-        node_spacing(self.scene.space.edges(), self.nodes.shape())
-    }
-
-    /// FTLE of the surrogate at a point; `None` in missing cells.
-    #[inline]
-    pub fn ftle(&self, unit: UnitPoint) -> Option<f32> {
-        if self.missing.is_some_and(|missing| missing(self.scene.space.domain_point(self.scene.space.grid_of_unit(unit)))) {
-            return None;
-        }
-        Some(self.nodes.at(unit) * self.scene.inverse_tau)
-    }
-
-    /// Extinction at a point, per scene length.
-    #[inline]
-    pub fn extinction(&self, unit: UnitPoint) -> f32 {
-        self.ftle(unit).map_or(0.0, |ftle| self.scene.transfer.extinction(ftle))
-    }
-
-    /// Optical depth from a point to the light, by the midpoint rule.
-    pub fn depth_to_light(&self, point: GridPoint, step: f32) -> f32 {
-        let space = self.scene.space;
-        let (direction, distance, _) = self.scene.light.seen_from(space.scene_point(point));
-        let direction = space.grid_direction(direction);
-        let length = space.exit(point, direction).min(distance as f32);
-        let count = (length / step).ceil().clamp(1.0, MAX_POINTS);
-        let step = length / count;
-        let at = |i: usize| space.unit_of_grid(point.along(direction, (i as f32 + 0.5) * step));
-        (0..count as usize).map(|i| self.extinction(at(i))).sum::<f32>() * step
-    }
-
     /// Ray `j` of a pixel with steps of at most `step` scene units. `shift` draws a random shift of the ray for each pixel.
     pub fn ray(&self, pixel: u32, j: u64, step: f32, light: ToLight<'_>, shift: bool) -> RaySum {
         let (scene, space) = (self.scene, self.scene.space);

@@ -3,6 +3,7 @@
 use super::check::{check, check_fit};
 use super::files::expand;
 use super::group::{Group, grouped, open_group};
+use super::limits;
 use super::synthetic::{declared, synthesized};
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::calendar::Calendar;
@@ -513,11 +514,6 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<
         Some(synthetic) if paths.is_empty() => expand(&[synthesized(synthetic)?]),
         _ => expand(paths),
     }
-}
-
-/// Limits that the settings give.
-pub(super) fn limits(settings: &ArchiveSettings) -> Limits {
-    Limits::new(settings.memory_gib, settings.external)
 }
 
 /// Bytes of a node while a snapshot is read: a value of the file, in the library and converted; three components; the snapshot.

@@ -1,6 +1,6 @@
 //! Components in files of their own, and meshes and masks beside them: which files belong together.
 
-use super::archive::limits;
+use super::limits;
 use crate::archive_settings::ArchiveSettings;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Limits};

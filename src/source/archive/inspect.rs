@@ -1,8 +1,9 @@
 //! Inspection of an archive: what would be read from it, and why.
 
-use super::archive::{Archive, Displacement, files_of, limits};
+use super::archive::{Archive, Displacement, files_of};
 use super::check::check;
 use super::group::open_group;
+use super::limits;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::velocity;
 use crate::error::SourceError;

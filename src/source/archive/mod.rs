@@ -21,3 +21,11 @@ pub use memory::MemorySource;
 pub use read_ahead::{DEFAULT_READ_AHEAD, ReadAhead, read_ahead};
 pub use steady::Steady;
 pub use synthetic::{GlobeTurbulence, synthesize};
+
+use crate::ArchiveSettings;
+use crate::formats::Limits;
+
+/// Limits that the settings give.
+fn limits(settings: &ArchiveSettings) -> Limits {
+    Limits::new(settings.memory_gib, settings.external)
+}

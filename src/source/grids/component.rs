@@ -1,7 +1,7 @@
 //! One component of the velocity in a file, and its values at one time.
 
 use super::axes::runs;
-use super::mask::Mask;
+use super::land::Mask;
 use crate::cf::packing::Packing;
 use crate::error::SourceError;
 use crate::formats::DataFile;

@@ -1,12 +1,13 @@
 //! Frames that are rendered and audited entirely on the GPU: connects renderer, query router, predictors and audits.
 
 use super::audit::Audits;
+use super::predictor::Predictor;
 use super::renderer::GpuRenderer;
-use super::router::{DeviceLearns, DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
+use super::router::{DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
 use super::smooth::{GpuSmooth, SmoothRound};
 use crate::cuda::driver::Gpu;
-use crate::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
-use crate::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::cuda::network::{Filled, LabelPool, OnGpu};
+use crate::cuda::tracing::CudaTracer;
 use crate::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
 use ridgewatch_render::smooth::PictureError;
 use ridgewatch_render::{Film, RenderStats, Renderer};
@@ -22,45 +23,6 @@ pub struct GpuFrames {
     /// The picture that accumulates. `None` before the first smooth frame.
     smooth: Option<GpuSmooth>,
     gpu: Arc<Gpu>,
-}
-
-/// Device-side predictor of one frame.
-pub(in crate::cuda) enum Predictor<'a> {
-    Table(&'a DeviceTable),
-    /// The network, above a table if the surrogate has one, and the sink for labels if the device trains the network.
-    Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
-}
-
-impl<'a> Predictor<'a> {
-    fn of(frozen: &'a FrozenHybrid<OnGpu>, tracer: &'a CudaTracer) -> Result<Self, DeviceError> {
-        Ok(match frozen_parts(frozen)? {
-            (base, Some(network)) => {
-                let sink = network.label_sink(tracer.host().domain(), base, frozen.times);
-                Self::Network(network.network().above(base.map(|base| (base, frozen.shrinkage))).at(frozen.times), sink)
-            }
-            (Some(table), None) => Self::Table(table),
-            (None, None) => return Err(DeviceError::Unsupported { what: "a surrogate without table and network".into() }),
-        })
-    }
-
-    fn label_sink(&self) -> Option<&dyn DeviceLearns> {
-        match self {
-            Self::Network(_, Some(sink)) => Some(sink),
-            _ => None,
-        }
-    }
-}
-
-impl DevicePredict for Predictor<'_> {
-    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
-        // SAFETY: guaranteed by the caller.
-        unsafe {
-            match self {
-                Self::Table(table) => table.predict(points, count, out),
-                Self::Network(network, _) => network.predict(points, count, out),
-            }
-        }
-    }
 }
 
 /// Labels of a frame: a part on the host, the rest in the label pool on the device. Dropping them without a commit removes them from the pool.

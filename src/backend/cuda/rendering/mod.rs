@@ -9,6 +9,7 @@ mod host_parity;
 mod labels;
 mod march;
 mod memory;
+mod predictor;
 mod renderer;
 mod router;
 mod smooth;

@@ -3,8 +3,8 @@
 
 use super::combine::{CombineInput, FilmPlanes, GpuCombine};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
-use super::frames::Predictor;
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
+use super::predictor::Predictor;
 use super::router::DeviceLogStretch;
 use crate::Smooth;
 use crate::cuda::driver::Gpu;
