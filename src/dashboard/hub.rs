@@ -304,7 +304,7 @@ impl Hub {
             clients,
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
-            steering: self.wheel.reach(),
+            steering: self.wheel.reach_for(token_to_share.is_some()),
             token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])

@@ -40,6 +40,10 @@ fn commands_are_passed_on_and_their_answers_back() {
     // Before the run and after it.
     visitor.until_state(|state| state["steering"]["none"].as_str().is_some_and(|why| why.contains("cannot be reached")));
     assert!(refused(&mut visitor, json!({"paused": true})).contains("the run is not steered: its command socket cannot be reached"));
+    // The reason names a file, which is not for those who only watch.
+    let state = Visitor::open(stage.address(), stage.dashboard.watching_url().split_once("token=").unwrap().1).until_state(|_| true);
+    assert!(state["steering"]["none"].as_str().unwrap().contains("is not reached;"), "{state}");
+    assert!(!state["steering"].to_string().contains("connection"), "{state}");
     let socket = command_socket(stage.folder.path());
     visitor.until_state(|state| state["steering"]["ready"] == json!({"commands": 0, "paused": false, "dimensions": 2}));
     let paused = answer(&mut visitor, 2, json!({"paused": true}));
