@@ -4,7 +4,7 @@
 # make test-reader     tests the NumPy reader of networks
 # make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
 # make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
-#                      with root also from another user, and `make fuzz`
+#                      with root also from another user, a Python client that steers, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
 # make adapters        builds the C library, the Fortran module and, if pip and the network are available, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver. The flags of the pkg-config file let
@@ -123,6 +123,7 @@ test-dashboard: packages
 
 test-long: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
+	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test dashboard python -- --ignored
 	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-zmtp -- --ignored; else \
 	  echo "NOT RUN: the test that other users are refused, since it needs root"; fi
 	FLOOD_SECONDS="$(or $(SECONDS),600)" $(CARGO) test --release --test publish_flood -- --ignored --nocapture

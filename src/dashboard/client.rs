@@ -53,10 +53,10 @@ enum Turn {
 
 /// Serves a browser until it leaves, is lost, or loses its place. One that may steer is told a token to share with those who may not.
 pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>, token_to_share: Option<String>) {
-    let place = hub.enter();
+    let place = hub.enter(token_to_share.is_some());
     let end = tokio::select! {
         end = talk(&mut socket, &hub, &place, token_to_share.as_deref()) => end,
-        () = place.displaced.notified() => End::Closed(DISPLACED, "too many pages are open; this one has drawn nothing for longest"),
+        () = place.displaced.notified() => End::Closed(DISPLACED, "too many pages are open; those that only watch give way first"),
     };
     if let End::Closed(code, reason) = end {
         let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));

@@ -88,6 +88,7 @@ struct Clients {
 #[derive(Debug)]
 struct Member {
     number: u64,
+    may_steer: bool,
     /// Last sign that it shows pictures.
     active: Instant,
     displaced: Arc<Notify>,
@@ -165,17 +166,20 @@ impl Hub {
         }
     }
 
-    /// Takes a place. If all are taken, the browser that has drawn nothing for longest loses its own.
-    pub fn enter(self: &Arc<Self>) -> Place {
+    /// Takes a place. If all are taken, a browser loses its own: one that only watches if there is one, so that nobody who watches can push out
+    /// those who steer; of these the one that has drawn nothing for longest.
+    pub fn enter(self: &Arc<Self>, may_steer: bool) -> Place {
         let mut clients = lock(&self.clients);
-        if clients.there.len() >= MAX_CLIENTS
-            && let Some((idlest, _)) = clients.there.iter().enumerate().min_by_key(|(_, member)| member.active)
-        {
-            clients.there.swap_remove(idlest).displaced.notify_one();
-        }
         let (number, displaced) = (clients.next, Arc::new(Notify::new()));
         clients.next += 1;
-        clients.there.push(Member { number, active: Instant::now(), displaced: Arc::clone(&displaced) });
+        clients.there.push(Member { number, may_steer, active: Instant::now(), displaced: Arc::clone(&displaced) });
+        if clients.there.len() > MAX_CLIENTS
+            && let Some((first, _)) =
+                clients.there.iter().enumerate().min_by_key(|(_, member)| (member.may_steer, member.active, member.number))
+        {
+            clients.there.swap_remove(first).displaced.notify_one();
+        }
+        drop(clients);
         Place { hub: Arc::clone(self), number, displaced }
     }
 
@@ -300,7 +304,7 @@ impl Hub {
             clients,
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
-            steering: self.wheel.reach(),
+            steering: self.wheel.reach_for(token_to_share.is_some()),
             token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
@@ -401,6 +405,38 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Numbers of the members that are left.
+    fn left(hub: &Hub) -> Vec<u64> {
+        let mut left: Vec<_> = lock(&hub.clients).there.iter().map(|member| member.number).collect();
+        left.sort_unstable();
+        left
+    }
+
+    #[test]
+    fn those_who_watch_push_out_nobody_who_steers() {
+        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0));
+        let steering = hub.enter(true);
+        let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
+        assert_eq!(left(&hub).len(), MAX_CLIENTS);
+        assert!(left(&hub).contains(&steering.number) && !left(&hub).contains(&watching[0].number));
+        // Of those who watch, the one that has just drawn stays.
+        let oldest = &watching[MAX_CLIENTS + 1];
+        assert!(left(&hub).contains(&oldest.number));
+        oldest.is_active();
+        let _next = hub.enter(true);
+        assert!(left(&hub).contains(&oldest.number));
+        let more: Vec<_> = (0..MAX_CLIENTS - 2).map(|_| hub.enter(true)).collect();
+        assert!(left(&hub)[..1] == [steering.number] && left(&hub).len() == MAX_CLIENTS);
+        // All steer: who comes to watch finds no place, who comes to steer takes that of the idlest.
+        let late = hub.enter(false);
+        assert!(!left(&hub).contains(&late.number) && left(&hub).contains(&steering.number));
+        more.iter().for_each(Place::is_active);
+        let latest = hub.enter(true);
+        assert!(left(&hub).contains(&latest.number) && !left(&hub).contains(&steering.number));
+        drop((steering, watching, more, late));
+        assert_eq!(left(&hub).len(), 2);
+    }
 
     #[test]
     fn a_publisher_is_silent_after_five_of_its_intervals() {

@@ -16,6 +16,8 @@ const MAX_WAITING: usize = 64;
 const LOOK: Duration = Duration::from_secs(1);
 /// Shortest time between two attempts to reach the socket.
 const RECONNECT: Duration = Duration::from_millis(500);
+/// What those who only watch are told; the reason may name files of this machine.
+const NOT_STEERED: &str = "its command socket is not reached; the page of those who may steer says why";
 /// Shortest time between two commands, so that all pages together stay below what the socket accepts.
 const SPACING: Duration = Duration::from_millis(15);
 
@@ -59,6 +61,14 @@ impl Wheel {
 
     pub fn reach(&self) -> Reach {
         self.reach.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// As a page is told, which may steer or only watch.
+    pub fn reach_for(&self, may_steer: bool) -> Reach {
+        match self.reach() {
+            Reach::None(_) if !may_steer && self.file.is_some() => Reach::None(NOT_STEERED.to_owned()),
+            reach => reach,
+        }
     }
 
     fn set(&self, reach: Reach) {

@@ -105,7 +105,7 @@ impl Shared {
         if members.len() >= self.limits.connections {
             let present: Vec<_> =
                 members.iter().map(|one| (one.owner, one.is_known.load(Ordering::Relaxed), *lock(&one.last_message))).collect();
-            if let Some(index) = displaced(&present) {
+            if let Some(index) = first_to_go(&present) {
                 members.remove(index).close.notify_one();
             }
         }
@@ -167,6 +167,13 @@ impl Shared {
         }
         Ok(())
     }
+}
+
+/// Index of the connection to close: one that has proved nothing if there is one, whoever has most of the others.
+fn first_to_go(present: &[(Owner, bool, Instant)]) -> Option<usize> {
+    let unknown: Vec<usize> = (0..present.len()).filter(|&index| !present[index].1).collect();
+    let of_unknown: Vec<_> = unknown.iter().map(|&index| present[index]).collect();
+    displaced(&of_unknown).map(|at| unknown[at]).or_else(|| displaced(present))
 }
 
 /// Adds a message of these parts.
@@ -257,6 +264,26 @@ mod tests {
             std::mem::forget(stranger);
         }
         known.ask(&[b"known"], LIMIT).await.unwrap();
+    }
+
+    #[test]
+    fn many_proven_connections_of_one_owner_do_not_give_way_to_strangers() {
+        let begin = Instant::now();
+        // Positive: has proved who it is. The first is idle for longest.
+        let connection = |(at, n): (usize, &i32)| (Owner::User(n.unsigned_abs()), *n > 0, begin + Duration::from_secs(at as u64));
+        for (there, gone) in [
+            (&[1, 1, -2, -3][..], 2),
+            (&[1, 1, 1, -1], 3),
+            // Of those that have proved nothing, the owner with the most of them loses one.
+            (&[1, 1, 1, -2, -3, -4, -3], 4),
+            (&[-2, 1, -1, 3, -1], 2),
+            // All have proved it.
+            (&[1, 2, 2, 3], 1),
+        ] {
+            let present: Vec<_> = there.iter().enumerate().map(connection).collect();
+            assert_eq!(first_to_go(&present), Some(gone), "{there:?}");
+        }
+        assert_eq!(first_to_go(&[]), None);
     }
 
     #[test]

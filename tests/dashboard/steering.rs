@@ -7,6 +7,7 @@ use ridgewatch::run::Steering;
 use ridgewatch::steer::CommandSocket;
 use serde_json::{Value, json};
 use std::path::Path;
+use std::process::{Command, Output};
 use std::sync::Arc;
 
 fn command_socket(folder: &Path) -> CommandSocket {
@@ -40,6 +41,10 @@ fn commands_are_passed_on_and_their_answers_back() {
     // Before the run and after it.
     visitor.until_state(|state| state["steering"]["none"].as_str().is_some_and(|why| why.contains("cannot be reached")));
     assert!(refused(&mut visitor, json!({"paused": true})).contains("the run is not steered: its command socket cannot be reached"));
+    // The reason names a file, which is not for those who only watch.
+    let state = Visitor::open(stage.address(), stage.dashboard.watching_url().split_once("token=").unwrap().1).until_state(|_| true);
+    assert!(state["steering"]["none"].as_str().unwrap().contains("is not reached;"), "{state}");
+    assert!(!state["steering"].to_string().contains("connection"), "{state}");
     let socket = command_socket(stage.folder.path());
     visitor.until_state(|state| state["steering"]["ready"] == json!({"commands": 0, "paused": false, "dimensions": 2}));
     let paused = answer(&mut visitor, 2, json!({"paused": true}));
@@ -77,6 +82,43 @@ fn a_page_without_a_command_socket_is_told_so() {
     let state = visitor.until_state(|_| true);
     assert!(state["steering"]["none"].as_str().unwrap().contains("without --steer"), "{state}");
     assert!(refused(&mut visitor, json!({"paused": true})).contains("without --steer"));
+}
+
+/// What `examples/steer.py` does with a connection file and a command.
+fn python_client(file: &Path, command: &str) -> Output {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/steer.py");
+    let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    Command::new(python).arg(script).arg(file).arg(command).output().unwrap()
+}
+
+#[test]
+#[ignore = "needs a Python with pyzmq, named by PYTHON"]
+fn the_python_client_says_what_became_of_its_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("commands.connection");
+    let fails = |command: &str, why: &str| {
+        let output = python_client(&file, command);
+        let said = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
+        assert!(output.status.code() == Some(1) && said.contains(why) && !said.contains("Traceback"), "{command}: {said}");
+    };
+    fails("{}", "the connection file cannot be read");
+    std::fs::write(&file, "nothing\n").unwrap();
+    fails("{}", "is no connection file");
+    let socket = command_socket(folder.path());
+    let output = python_client(&file, "{\"paused\": true}");
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(output.status.success() && answer["accepted"]["paused"] == true && answer["number"] == 1, "{answer}");
+    fails("{\"trust.tolerance\": -1}", "`trust.tolerance` is -1.0");
+    fails("paused", "the command is no JSON");
+    fails("7", "cannot be read");
+    // The key of another run, then no run at all.
+    let text = std::fs::read_to_string(&file).unwrap();
+    let key = text.lines().find(|line| line.starts_with("key")).unwrap();
+    std::fs::write(&file, text.replace(key, &format!("key = {}", "0".repeat(64)))).unwrap();
+    fails("{}", "not signed by this run");
+    drop(socket);
+    std::fs::write(&file, &text).unwrap();
+    fails("{}", "no answer came within 5 seconds");
 }
 
 /// More commands than are answered at a time: each gets an answer, and the page stays.

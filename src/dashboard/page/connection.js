@@ -42,9 +42,11 @@ export class Connection {
     socket.onclose = ({ code }) => (code === DISPLACED ? this.stop() : this.lose());
   }
 
-  /** Sends a message, if the connection is open. */
+  /** Sends a message, if the connection is open. Returns whether it did. */
   say(message) {
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    if (this.socket.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
   }
 
   receive(socket, data) {

@@ -312,7 +312,7 @@ explainTerms(element("tip"), element("terms"));
 showPosition();
 connection = new Connection(takeToken(), {
   message: (message, reply) => RECEIVERS[message.kind]?.(message, reply),
-  opened: () => { server = null; steering.reset(); },
+  opened: () => { server = null; steering.abandon(); },
   broken: (error) => warnings.hold("message", `A message of the server was skipped: ${error.message}`),
 });
 setInterval(refresh, REFRESH);

@@ -9,7 +9,7 @@ const WHEEL = 0.0015;
 const STEP = 0.08;
 
 export class Steering {
-  /** `say(message)` sends; `told(text)` is called with what the viewer should know; `acted()` when the viewer steers. */
+  /** `say(message)` sends, and returns whether it did; `told(text)` is called with what the viewer should know; `acted()` when the viewer steers. */
   constructor({ say, told, acted }) {
     Object.assign(this, { say, told, acted });
     this.state = null;
@@ -29,17 +29,25 @@ export class Steering {
     this.seen = 0;
   }
 
+  /** As `reset`, and says what got no answer. */
+  abandon() {
+    const { flying, waiting } = this;
+    const keys = Object.keys({ ...(flying?.answered ? {} : flying?.set), ...waiting });
+    if (keys.length > 0) this.told(`No answer came: ${keys.join(", ")} may be lost`, null, true);
+    this.reset();
+  }
+
   /** Takes in the server's state. */
   receiveState({ steering, token_to_share: token }) {
     this.state = steering ?? null;
     this.mayCommand = token !== undefined;
-    if (this.flying && performance.now() - this.flying.at > LOST) this.reset();
+    if (this.flying && performance.now() - this.flying.at > LOST) this.abandon();
   }
 
   /** Takes in new records, in order. */
   receiveRecords(records) {
     for (const record of records) {
-      if (record.frame < this.record?.frame) this.reset();
+      if (record.frame < this.record?.frame) this.abandon();
       this.record = record;
       const commands = Array.isArray(record.commands) ? record.commands : [];
       for (const { number, set } of commands) {
@@ -79,12 +87,15 @@ export class Steering {
     this.number += 1;
     this.flying = { number: this.number, set: this.waiting, at: performance.now() };
     this.waiting = {};
-    this.say({ command: this.number, set: this.flying.set });
+    if (this.say({ command: this.number, set: this.flying.set })) return;
+    this.told("Not sent: no connection", null, true);
+    this.reset();
   }
 
   receiveAnswer({ command, accepted, refused }) {
-    if (this.flying?.number !== command) return;
+    if (this.flying?.number !== command || this.flying.answered) return;
     const { set, at } = this.flying;
+    this.flying.answered = true;
     if (accepted) {
       this.state = { ready: accepted };
       if (set.camera !== undefined && this.waiting.camera === undefined) this.shownBy = accepted.commands;
@@ -93,7 +104,13 @@ export class Steering {
       this.told(`Refused: ${refused}`, null, true);
       if (set.camera !== undefined) this.wanted = this.shownBy = null;
     }
-    setTimeout(() => { this.flying = null; this.send(); }, Math.max(0, SPACING - (performance.now() - at)));
+    const next = () => {
+      // After a reset a later command may be on its way.
+      if (this.flying?.number !== command) return;
+      this.flying = null;
+      this.send();
+    };
+    setTimeout(next, Math.max(0, SPACING - (performance.now() - at)));
   }
 
   get camera() { return this.wanted ?? this.record?.camera ?? null; }

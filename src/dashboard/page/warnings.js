@@ -109,7 +109,7 @@ function connectionConditions(view, now) {
     return [{ id: "link", level: "critical", text }];
   }
   if (view.link === "displaced") {
-    return [{ id: "link", level: "critical", text: "Too many pages are open, and this one was idle longest. Reload it to watch again." }];
+    return [{ id: "link", level: "critical", text: "Too many pages are open, and this one gave way. Reload it to come back." }];
   }
   if (view.link === "lost") {
     const tick = view.retryAt === null ? "trying again" : `trying again in ${Math.max(0, Math.ceil((view.retryAt - now) / 1000))} s`;

@@ -54,6 +54,36 @@ test("until the frame of a camera comes, moves begin at what was asked for", asy
   assert.equal(distance(), 2);
 });
 
+test("a command without a connection is told, and the next one is sent", () => {
+  const { steering, said, told } = steered();
+  const say = steering.say;
+  steering.say = () => false;
+  steering.zoom(0.5);
+  assert.deepEqual([told, said, steering.camera], [["Not sent: no connection"], [], camera]);
+  steering.say = say;
+  steering.togglePause();
+  assert.deepEqual(said.map(({ set }) => set), [{ paused: true }]);
+  // The connection ends before the answer.
+  steering.abandon();
+  assert.equal(told[1], "No answer came: paused may be lost");
+  steering.abandon();
+  assert.equal(told.length, 2);
+});
+
+test("an answer from before a reset does not end a later command", async () => {
+  const { steering, said } = steered();
+  steering.togglePause();
+  steering.receiveAnswer({ command: 1, accepted: ready(1, true) });
+  steering.abandon();
+  steering.togglePause();
+  steering.zoom(0.5);
+  await pause(100);
+  assert.deepEqual(said.map(({ command }) => command), [1, 2]);
+  steering.receiveAnswer({ command: 2, accepted: ready(2) });
+  await pause(100);
+  assert.deepEqual(Object.keys(said[2].set), ["camera"]);
+});
+
 test("a refusal is told and leaves the view, and who may not command sends nothing", () => {
   const { steering, said, told } = steered();
   steering.zoom(0.5);
