@@ -559,10 +559,7 @@ impl<B: Backend> Cycle<'_, B> {
     /// (unless the network has the start time as an input).
     fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         self.look_at_steps(slide)?;
-        self.trace_anew(slide)?;
-        let Run { renderer, threads, .. } = &mut self.run;
-        threads.render().install(|| renderer.window_slid());
-        Ok(())
+        self.trace_anew(slide)
     }
 
     /// Makes the flow map of a slide, and all that was traced by the one before.
@@ -575,6 +572,8 @@ impl<B: Backend> Cycle<'_, B> {
         if with!(&self.session, on => on.surrogate.is_some()) {
             transaction!(self, slide, run, on => run.slide_labels(on));
         }
+        let Run { renderer, threads, .. } = &mut self.run;
+        threads.render().install(|| renderer.window_slid());
         Ok(())
     }
 
@@ -598,7 +597,9 @@ impl<B: Backend> Cycle<'_, B> {
                 });
                 self.trace_anew(slide)?;
                 self.run.learning.trust.reset();
-                transaction!(self, slide, run, on => run.probe(on, slide.index));
+                // Other points than at the begin of the slide, which the network was trained on.
+                let stream = slide.index + ((self.run.progress.frame + 1) << 32);
+                transaction!(self, slide, run, on => run.probe(on, stream));
             }
             slide.waited += std::mem::take(&mut self.run.progress.waited);
             let place =
@@ -637,7 +638,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             let is_due = number >= planned && slides.is_awaited() == Some(false);
             // A new view that comes while a simulation's next step is awaited gets as many frames as a slide.
-            let is_new = slides.is_awaited() == Some(true) && since_command.is_some_and(|frames| frames < planned);
+            let is_new = !slides.is_over() && slides.is_awaited() == Some(true) && since_command.is_some_and(|frames| frames < planned);
             if !is_done && !is_due && (number < most || is_new) {
                 continue;
             }
@@ -728,12 +729,12 @@ impl Run<'_> {
         changed
     }
 
-    /// Takes no more commands. Those that were accepted too late are told.
+    /// Takes no more commands. Those that no frame shows are told.
     fn end_commands(&mut self) {
-        let late = self.options.steering.as_ref().map(|steering| steering.end()).unwrap_or_default();
+        let mut late = std::mem::take(&mut self.progress.commands);
+        late.extend(self.options.steering.iter().flat_map(|steering| steering.end()));
         if let (Some(first), Some(last)) = (late.first(), late.last()) {
-            let numbers = format!("{} to {}", first.number, last.number);
-            self.progress.warnings.push(format!("commands {numbers} came after the last frame began and had no effect"));
+            self.progress.warnings.push(format!("commands {} to {} came too late: no frame shows them", first.number, last.number));
         }
     }
 
@@ -765,7 +766,7 @@ impl Run<'_> {
     fn checkpoint_if_due<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         if let (Some(checkpoints), Some(surrogate)) = (&mut self.checkpoints, &mut on.surrogate) {
             let (pause, warning) = checkpoints.after_frame(self.progress.frame - 1, surrogate)?;
-            self.progress.checkpoint_pause = pause;
+            self.progress.checkpoint_pause += pause;
             self.progress.warnings.extend(warning);
         }
         Ok(())

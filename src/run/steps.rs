@@ -86,7 +86,8 @@ pub(super) fn is_outdated(shown: Shown<'_>, slide: &Slide, chosen: StepChoice, s
     // Where the choice had no more steps to give, their residual may be larger.
     let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };
     let share = comparison.of(settled.steps)?.residual / most;
-    let is_least = settled.steps <= chosen.multiple_of;
+    // Outside its tolerance a choice has no fewer steps to give either.
+    let is_least = settled.steps <= chosen.multiple_of || !chosen.within_tolerance;
     Ok(share > *AGAIN.end() || share < *AGAIN.start() && !is_least)
 }
 

@@ -99,7 +99,7 @@ fn what_comes_too_late_is_told() {
         false
     });
     assert!(frames.len() == 1 && frames[0].record.commands.is_empty());
-    let told = report.warnings.iter().any(|warning| warning.contains("commands 1 to 1 came after the last frame began and had no effect"));
+    let told = report.warnings.iter().any(|warning| warning.contains("commands 1 to 1 came too late: no frame shows them"));
     assert!(told, "{:?}", report.warnings);
 }
 
