@@ -359,19 +359,21 @@ RW_FN void fill_node(const FrameScene& scene, const March& march, uint32_t index
     volume.depth[index] = depth_to_light(scene, march, point, volume.step);
 }
 
-// Offset of a ray across (axis 0) or down (1) its pixel: pairs on opposite sides of the centre, first the four points of Gauss's rule, then an additive
-// recurrence in two dimensions (Roberts 2018).
+// Offset of a ray across (axis 0) or down (1) its pixel: in fours, a point and its quarter turns around the centre. The first point is that of Gauss's
+// rule, the others are those of an additive recurrence in two dimensions.
 RW_FN float ray_offset(uint32_t ray, int axis) {
-    const double plastic = 1.324717957244746, gauss = 0.2886751345948129;
-    const uint32_t pair = ray / 2;
-    double point;
-    if (pair < 2) {
-        point = pair == 1 && axis == 1 ? 0.5 + gauss : 0.5 - gauss;
-    } else {
-        const double x = 0.5 + double(pair - 1) * (axis == 0 ? 1.0 / plastic : 1.0 / (plastic * plastic));
-        point = x - floor_(x);
+    const double gauss = 0.2886751345948129, sqrt_2 = 1.4142135623730951, sqrt_3 = 1.7320508075688772;
+    const uint32_t number = ray / 4;
+    const bool turned = ray / 2 % 2 == 1;
+    // A turn makes -y of x and x of y.
+    const bool along_x = (axis == 0) != turned;
+    double point = -gauss;
+    if (number > 0) {
+        const double x = along_x ? 0.57 + double(number - 1) * sqrt_2 : 0.81 + double(number - 1) * sqrt_3;
+        point = x - floor_(x) - 0.5;
     }
-    return float(ray % 2 == 0 ? point : 1.0 - point);
+    if (turned && axis == 0) point = -point;
+    return float(ray % 2 == 0 ? 0.5 + point : 0.5 - point);
 }
 
 // Colour of the light at a quadrature point, given the weight of the point times the transmittance to the light.

@@ -67,7 +67,7 @@ fn columns(line: &str) -> usize {
 fn pictures_converge_and_the_chart_is_drawn() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("chart");
-    run(&mut ridgewatch(command("chart", &out, &["--only", "pictures,scaling", "--seconds", "100"]))).success();
+    run(&mut ridgewatch(command("chart", &out, &["--only", "pictures,scaling", "--seconds", "60"]))).success();
     let chart = json(&out.join("chart.json"));
     let curves = chart["pictures"]["curves"].as_array().unwrap();
     let frames = |method: &str| {

@@ -1,8 +1,8 @@
 //! Marching: the expected picture of the surrogate, by quadrature along camera rays (emission and absorption, Max 1995).
 //!
-//! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through the same points in every pixel, two by two on
-//! opposite sides of its centre, so that no even number of rays shifts the picture: first the four points of Gauss's rule, then an additive recurrence
-//! in two dimensions (Roberts 2018), which fills the pixel evenly.
+//! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through the same points in every pixel, in fours: a point
+//! and its quarter turns around the centre, so that no such number of rays shifts the picture or blurs one direction more than another. The first point is
+//! that of Gauss's rule, the others are those of an additive recurrence in two dimensions, which fills the pixel evenly.
 
 use super::light_volume::LightVolume;
 use super::medium::{MAX_POINTS, Medium};
@@ -50,17 +50,18 @@ impl RaySum {
 
 /// Offsets of ray `j`: across the pixel, down the pixel, and of the quadrature points in their steps (the midpoint rule).
 fn offsets(j: u64) -> [f32; 3] {
-    /// The root of x^3 = x + 1.
-    const PLASTIC: f64 = 1.324_717_957_244_746;
     /// Distance of Gauss's two points from the middle of the unit interval, 1 / sqrt 12.
     const GAUSS: f64 = 0.288_675_134_594_812_9;
-    let pair = j / 2;
-    let point = match pair {
-        0 => [0.5 - GAUSS, 0.5 - GAUSS],
-        1 => [0.5 - GAUSS, 0.5 + GAUSS],
-        _ => [1.0 / PLASTIC, 1.0 / (PLASTIC * PLASTIC)].map(|a| (0.5 + (pair - 1) as f64 * a).fract()),
+    /// The recurrence's first point and its steps, sqrt 2 and sqrt 3. Of 10,000 first points this one has the smallest error of edges and ridges after its
+    /// worst number of rays.
+    const START: [f64; 2] = [0.57, 0.81];
+    const STEPS: [f64; 2] = [std::f64::consts::SQRT_2, 1.732_050_807_568_877_2];
+    let point = match j / 4 {
+        0 => [-GAUSS, -GAUSS],
+        number => std::array::from_fn(|k| (START[k] + (number - 1) as f64 * STEPS[k]).fract() - 0.5),
     };
-    let [x, y] = point.map(|x| (if j.is_multiple_of(2) { x } else { 1.0 - x }) as f32);
+    let [x, y] = if (j / 2).is_multiple_of(2) { point } else { [-point[1], point[0]] };
+    let [x, y] = [x, y].map(|x| (if j.is_multiple_of(2) { 0.5 + x } else { 0.5 - x }) as f32);
     [x, y, 0.5]
 }
 
@@ -141,23 +142,66 @@ mod tests {
     use super::offsets;
     use crate::smooth::{AUDIT_RAYS, AuditedPixel, MIN_RAYS, MarchControl};
 
+    const AUDITED: [u64; 4] = [4, 8, 12, 16];
+
+    /// Stated and found squared error after 4, 8, 12... rays of a pattern that lies across the pixel, audited as a picture audits it. `shown` gives the
+    /// colour at a distance from an edge or ridge.
+    fn stated_and_found(shown: impl Fn(f32) -> f32, angle: f32, most: u64) -> Vec<[f64; 2]> {
+        const PLACES: usize = 240;
+        let mut control = MarchControl::default();
+        let mut found = vec![0.0; (most / MIN_RAYS) as usize];
+        let mut audits = [const { Vec::new() }; AUDITED.len()];
+        for place in 0..PLACES {
+            let at = -1.2 + 2.4 * (place as f32 + 0.5) / PLACES as f32;
+            let shown = |[x, y]: [f32; 2]| f64::from(shown((x - 0.5) * angle.cos() + (y - 0.5) * angle.sin() - at));
+            let mean = |from: u64, to: u64| (from..to).map(|j| shown([offsets(j)[0], offsets(j)[1]])).sum::<f64>() / (to - from) as f64;
+            let truth = (0..1600).map(|i| shown([i % 40, i / 40].map(|n| (n as f32 + 0.5) / 40.0))).sum::<f64>() / 1600.0;
+            for (number, square) in found.iter_mut().enumerate() {
+                *square += (mean(0, MIN_RAYS * (number as u64 + 1)) - truth).powi(2) / PLACES as f64;
+            }
+            for (audit, rays) in audits.iter_mut().zip(AUDITED) {
+                let [first, following] = [mean(0, rays), mean(rays, rays + AUDIT_RAYS)];
+                audit.push(AuditedPixel { alpha: 1.0, first: [first; 3], following: [following; 3], ..AuditedPixel::default() });
+            }
+        }
+        let stated = |(number, found): (usize, &f64)| {
+            let rays = MIN_RAYS * (number as u64 + 1);
+            if let Some(audit) = audits.get(number) {
+                control.rays = rays;
+                audit.iter().for_each(|pixel| control.audit(pixel));
+            }
+            control.rays = rays;
+            [control.error(), *found]
+        };
+        found.iter().enumerate().map(stated).collect()
+    }
+
     /// Edges across a pixel, also along its axes: their error is not understated by much, and not overstated by more.
     #[test]
     fn edges_of_all_directions_are_audited() {
         for angle in [0.0, 0.02, 0.1, 0.4, 0.785, 1.2, 1.5508, std::f32::consts::FRAC_PI_2] {
-            let (mut control, mut square, mut count) = (MarchControl::default(), 0.0, 0.0);
-            for place in 0..400 {
-                let edge = -0.75 + 1.5 * (place as f32 + 0.5) / 400.0;
-                let shown = |[x, y]: [f32; 2]| if (x - 0.5) * f32::cos(angle) + (y - 0.5) * f32::sin(angle) < edge { 1.0 } else { 0.0 };
-                let mean = |from: u64, to: u64| (from..to).map(|j| shown([offsets(j)[0], offsets(j)[1]])).sum::<f64>() / (to - from) as f64;
-                let [first, following] = [mean(0, MIN_RAYS), mean(MIN_RAYS, MIN_RAYS + AUDIT_RAYS)];
-                let truth = (0..6400).map(|i| shown([i % 80, i / 80].map(|n| (n as f32 + 0.5) / 80.0))).sum::<f64>() / 6400.0;
-                control.audit(&AuditedPixel { alpha: 1.0, first: [first; 3], following: [following; 3], ..AuditedPixel::default() });
-                (square, count) = (square + (first - truth).powi(2), count + 1.0);
-            }
-            control.rays = MIN_RAYS;
-            let (stated, found) = (control.error(), square / count);
+            let [stated, found] = stated_and_found(|distance| f32::from(distance < 0.0), angle, MIN_RAYS)[0];
             assert!(stated > 0.9 * found && stated < 2.0 * found, "angle {angle}: {stated} stated, {found} found");
         }
+    }
+
+    /// Edges, and ridges of a fraction of a pixel as small pictures have them, in all directions: after any number of rays their error is not understated,
+    /// and it falls about as that of independent rays or faster.
+    #[test]
+    fn more_rays_have_a_smaller_error() {
+        const ANGLES: usize = 24;
+        let mut all = [0.0; 16];
+        for width in [0.0_f32, 0.1, 0.2, 0.3] {
+            let shown = |distance: f32| if width > 0.0 { (-0.5 * (distance / width).powi(2)).exp() } else { f32::from(distance < 0.0) };
+            let mut sums = [[0.0; 2]; 16];
+            for angle in 0..ANGLES {
+                let errors = stated_and_found(shown, std::f32::consts::PI * (angle as f32 + 0.3) / ANGLES as f32, 64);
+                sums.iter_mut().zip(errors).for_each(|(sum, error)| (0..2).for_each(|k| sum[k] += error[k]));
+            }
+            assert!(sums.iter().all(|[stated, found]| stated > found), "width {width}: {sums:?}");
+            all.iter_mut().zip(sums).for_each(|(all, [_, found])| *all += found);
+        }
+        let times_rays: Vec<f64> = all.iter().zip(1..).map(|(square, fours)| square / all[0] * f64::from(fours)).collect();
+        assert!(times_rays.iter().all(|share| *share < 1.2) && times_rays[15] < 0.6, "{times_rays:.2?}");
     }
 }

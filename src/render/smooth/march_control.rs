@@ -5,8 +5,9 @@ use crate::rng::FrameRandom;
 
 /// Rays come two by two, on opposite sides of the pixel's centre.
 pub const PAIR: u64 = 2;
-/// Rays per pixel of the first round, and the most a picture gets.
+/// Rays per pixel of the first round and, at least, of others: two pairs, a quarter turn apart.
 pub const MIN_RAYS: u64 = 4;
+/// Most rays per pixel that a picture gets.
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
@@ -19,7 +20,7 @@ const SPARE: f64 = 0.25;
 const MIN_AUDITS: u64 = 4;
 /// Pixels per audit. Most of the error is at edges, in few of them.
 const AUDITED_PIXELS: u64 = 1024;
-/// Rays after the first `MIN_RAYS` against which these are audited. They share no coordinate with them, so that edges along the axes show too.
+/// Rays of an audit that follow those it compares. They share no coordinate with them, so that edges along the axes show too.
 pub const AUDIT_RAYS: u64 = 16;
 /// Steps of an audit in one step of the march.
 pub const AUDIT_STEPS: u64 = 4;
@@ -35,7 +36,7 @@ const AUDIT_DIMENSION: u32 = u32::MAX - 2;
 pub struct AuditedPixel {
     /// Opacity, the mean over all of its rays.
     pub alpha: f64,
-    /// The first `MIN_RAYS` rays, as marched.
+    /// The first [`MarchControl::audited_rays`] rays, as marched.
     pub first: [f64; 3],
     /// The `AUDIT_RAYS` rays that follow.
     pub following: [f64; 3],
@@ -88,7 +89,7 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Squared errors of the pixel filter with the first `MIN_RAYS` rays, of the steps and of the light volume, and twice the product of the last two.
+    /// Squared errors of the pixel filter times its rays, of the steps and of the light volume, and twice the product of the last two.
     filter: Mean,
     steps: Mean,
     light: Mean,
@@ -131,6 +132,11 @@ impl MarchControl {
         self.next_rays > 0 || self.audits < MIN_AUDITS
     }
 
+    /// Rays of the picture that an audit compares with those that follow.
+    pub fn audited_rays(&self) -> u64 {
+        self.rays.clamp(MIN_RAYS, AUDIT_RAYS)
+    }
+
     /// Pixels of the next audit, others in each.
     pub fn audit_pixels(&mut self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
         let first = self.audits * AUDITED_PIXELS;
@@ -151,7 +157,7 @@ impl MarchControl {
         let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
         // The rays that follow have an error of their own, so that this is rather too much.
         let filter = minus(pixel.first, pixel.following);
-        self.filter.add(dot(filter, filter));
+        self.filter.add(dot(filter, filter) * self.audited_rays() as f64);
         let steps = minus(pixel.pair, pixel.fine);
         self.steps.add(dot(steps, steps));
         if let Some(lit) = pixel.lit {
@@ -166,9 +172,9 @@ impl MarchControl {
         self.steps.bound() + self.light.bound() + self.both.bound().max(0.0)
     }
 
-    /// Error of the pixel filter, which falls at least as fast as with independent rays.
+    /// Error of the pixel filter, which falls about as that of independent rays or faster.
     fn filter(&self) -> f64 {
-        self.filter.bound() * MIN_RAYS as f64 / self.rays.max(1) as f64
+        self.filter.bound() / self.rays.max(1) as f64
     }
 
     /// Mean square error of marching, mean over channels.
@@ -180,7 +186,7 @@ impl MarchControl {
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
         let wanted = self.filter() > SPARE * allowed;
-        self.next_rays = if wanted && self.rays < MAX_RAYS { PAIR } else { 0 };
+        self.next_rays = if wanted && self.rays < MAX_RAYS { MIN_RAYS } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }

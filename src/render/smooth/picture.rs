@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
-use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, PAIR};
+use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
@@ -176,11 +176,10 @@ impl Picture {
             progress::mark();
             (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
         };
-        let (volume, fine) = (ToLight::Volume(light), step / AUDIT_STEPS as f32);
+        let (volume, fine, shown) = (ToLight::Volume(light), step / AUDIT_STEPS as f32, self.march.audited_rays());
         let look = |&pixel: &u32| {
-            let [(first, alpha), (following, more)] =
-                [0..MIN_RAYS, MIN_RAYS..MIN_RAYS + AUDIT_RAYS].map(|rays| mean(pixel, rays, step, volume));
-            let alpha = (alpha + more) / (MIN_RAYS + AUDIT_RAYS) as f64;
+            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(pixel, rays, step, volume));
+            let alpha = (alpha + more) / (shown + AUDIT_RAYS) as f64;
             let [pair, fine] = [step, fine].map(|step| mean(pixel, 0..PAIR, step, volume).0);
             AuditedPixel { alpha, first, following, pair, fine, lit: None }
         };

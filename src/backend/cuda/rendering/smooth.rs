@@ -12,7 +12,7 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, AUDIT_RAYS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH, MIN_RAYS,
+    AUDIT_PAIRS, AUDIT_RAYS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH,
     MarchControl, Marching, PAIR, PictureError, TileSums,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
@@ -187,7 +187,8 @@ impl GpuSmooth {
             (0..count).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
         };
         let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
-        let (each, pair) = ((MIN_RAYS + AUDIT_RAYS) as usize, PAIR as usize);
+        let (shown, pair) = (self.control.audited_rays() as usize, PAIR as usize);
+        let each = shown + AUDIT_RAYS as usize;
         let coarse = pixels.iter().flat_map(|&pixel| rays(pixel, each as u64, step, 0.0));
         let checks: Vec<RayCheck> = coarse.chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0))).collect();
         let found = self.march.check(&medium, &checks, round.smooth.sum)?;
@@ -196,7 +197,7 @@ impl GpuSmooth {
         }
         let (coarse, finer) = found.split_at(each * pixels.len());
         let look = |(coarse, fine): (&[[f32; 4]], &[[f32; 4]])| {
-            let (first, following) = coarse.split_at(MIN_RAYS as usize);
+            let (first, following) = coarse.split_at(shown);
             let [.., alpha] = mean::<4>(coarse);
             AuditedPixel { alpha, first: mean(first), following: mean(following), pair: mean(&first[..pair]), fine: mean(fine), lit: None }
         };
