@@ -17,7 +17,7 @@ combine_rows(const Quarters fine, float* __restrict__ rows, int width, int heigh
 
 // Blocks of 32 x 8 pixels.
 extern "C" __global__ void __launch_bounds__(256)
-combine_columns(const Quarters fine, const float* __restrict__ rows, float* coarse, const Level level, int spacing) {
+combine_columns(const Quarters fine, const float* __restrict__ rows, float* __restrict__ coarse, const Level level, int spacing) {
     const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
     if (x < level.width && y < level.height) split_level(fine, rows, coarse, level, x, y, spacing);
 }

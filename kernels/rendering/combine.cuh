@@ -47,18 +47,21 @@ struct Level {
 };
 static_assert(sizeof(Level) == 24, "layout");
 
+// 1 / weight, 0 without weight. Its products with radiances are cheaper than quotients, which are slow where the radiance is 0.
+RW_FN float reciprocal(float weight) { return weight > 0.0f ? 1.0f / weight : 0.0f; }
+
 RW_FN void put_details(const Level& level, int at, const float (&details)[2][3], const float (&weights)[2]) {
     const size_t pixels = size_t(level.width) * level.height;
-    const float both = weights[0] + weights[1];
+    const float per_both = reciprocal(weights[0] + weights[1]);
     for (int k = 0; k < 3; ++k) {
-        level.mean[k * pixels + at] = both > 0.0f ? (weights[0] * details[0][k] + weights[1] * details[1][k]) / both : 0.0f;
+        level.mean[k * pixels + at] = (weights[0] * details[0][k] + weights[1] * details[1][k]) * per_both;
     }
     const float a = luminance(details[0]), b = luminance(details[1]);
     level.energy[at] = a * b;
     level.energy[pixels + at] = 0.5f * (a * a + b * b);
 }
 
-// Details of a level at a pixel from the fine picture and its row-filtered planes, 8 as in `Quarters`. `coarse`, 8 planes, may be the fine ones.
+// Details of a level at a pixel from the fine picture and its row-filtered planes, 8 as in `Quarters`. `coarse`: 8 other planes.
 RW_FN void split_level(const Quarters& fine, const float* rows, float* coarse, const Level& level, int x, int y, int spacing) {
     const size_t pixels = size_t(level.width) * level.height;
     const int at = y * level.width + x;
@@ -74,7 +77,8 @@ RW_FN void split_level(const Quarters& fine, const float* rows, float* coarse, c
         RW_UNROLL
         for (int k = 0; k < 4; ++k) coarse[(4 * q + k) * pixels + at] = smooth[k];
         weights[q] = own[3];
-        for (int k = 0; k < 3; ++k) details[q][k] = own[3] > 0.0f ? own[k] / own[3] - (smooth[3] > 0.0f ? smooth[k] / smooth[3] : 0.0f) : 0.0f;
+        const float per_own = reciprocal(own[3]), per_smooth = own[3] > 0.0f ? reciprocal(smooth[3]) : 0.0f;
+        for (int k = 0; k < 3; ++k) details[q][k] = own[k] * per_own - smooth[k] * per_smooth;
     }
     put_details(level, at, details, weights);
 }
@@ -84,7 +88,8 @@ RW_FN void last_level(const Quarters& coarse, const Level& level, int at) {
     float details[2][3], weights[2];
     for (int q = 0; q < 2; ++q) {
         weights[q] = coarse.planes[q][3][at];
-        for (int k = 0; k < 3; ++k) details[q][k] = weights[q] > 0.0f ? coarse.planes[q][k][at] / weights[q] : 0.0f;
+        const float per_weight = reciprocal(weights[q]);
+        for (int k = 0; k < 3; ++k) details[q][k] = coarse.planes[q][k][at] * per_weight;
     }
     put_details(level, at, details, weights);
 }

@@ -101,7 +101,8 @@ pub struct FilmPlanes<'a> {
 /// Offsets of the planes of the working memory. The film overwrites planes that only the shrinkage needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Planes {
-    coarse: usize,
+    /// Levels are written to each in turn: reading and writing the same planes takes three times as long.
+    coarse: [usize; 2],
     rows: usize,
     energy: usize,
     boxed: usize,
@@ -112,9 +113,9 @@ struct Planes {
     count: usize,
 }
 
-const PLANES: Planes = Planes { coarse: 0, rows: 8, energy: 16, boxed: 18, mean: 20, halves: 23, film: 0, squared: 8, count: 29 };
+const PLANES: Planes = Planes { coarse: [0, 29], rows: 8, energy: 16, boxed: 18, mean: 20, halves: 23, film: 0, squared: 8, count: 37 };
 
-/// Combines pictures. It reuses its memory between frames: 29 planes, and the film in pinned memory.
+/// Combines pictures. It reuses its memory between frames: 37 planes, and the film in pinned memory.
 pub struct GpuCombine {
     gpu: Arc<Gpu>,
     rows: CudaFunction,
@@ -229,14 +230,15 @@ impl GpuCombine {
         let stream = self.gpu.work();
         let (across, down) = (width as i32, height as i32);
         let level = LevelArgument { mean: plane(PLANES.mean), energy: plane(PLANES.energy), width: across, height: down };
-        let (rows, coarse, boxed) = (plane(PLANES.rows), plane(PLANES.coarse), plane(PLANES.boxed));
+        let (rows, boxed) = (plane(PLANES.rows), plane(PLANES.boxed));
         let shrunk = plane(PLANES.halves + 3 * half);
         let sums = |number: usize| input.pairs.address() + (number * pixels * size_of::<f32>()) as u64;
         let mut fine = QuartersArgument {
             planes: [0, 1].map(|q| std::array::from_fn(|k| sums(if k == 3 { PAIR_COUNTS + q } else { 6 * half + 3 * q + k }))),
         };
-        let filtered = QuartersArgument { planes: [0, 1].map(|q| std::array::from_fn(|k| plane(PLANES.coarse + 4 * q + k))) };
         for number in 0..=LEVELS {
+            let first = PLANES.coarse[number as usize % 2];
+            let coarse = plane(first);
             let (spacing, fresh) = (1_i32 << number, i32::from(number == 0));
             // SAFETY: the arguments of the kernels of combine.cu; each address is that of as many planes as the kernel expects, in memory that is freed
             // in the order of the stream.
@@ -254,7 +256,7 @@ impl GpuCombine {
                 let mut call = stream.launch_builder(&self.gains);
                 launch(call.arg(&level).arg(&boxed).arg(&RADIUS).arg(&shrunk).arg(&fresh), box_columns(input.size))?;
             }
-            fine = filtered;
+            fine = QuartersArgument { planes: [0, 1].map(|q| std::array::from_fn(|k| plane(first + 4 * q + k))) };
         }
         Ok(())
     }

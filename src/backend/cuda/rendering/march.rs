@@ -27,6 +27,9 @@ const COLUMN_BLOCK: [usize; 2] = [16, 8];
 const PIXEL_BLOCK: usize = 16;
 /// Threads of a block of `march_checks`.
 const CHECK_BLOCK: u32 = 1024;
+/// Threads of a block if there are at least `MANY_CHECKS`: several blocks share a multiprocessor then, and one composes its ray while others look up.
+const SMALL_CHECK_BLOCK: u32 = 128;
+const MANY_CHECKS: usize = 1024;
 
 /// `Bricks` of `march.cuh`.
 #[repr(C)]
@@ -445,7 +448,8 @@ impl GpuMarch {
         from.write(checks)?;
         let out = room(&gpu, &mut self.checked, what, 4 * checks.len())?;
         let (given, found) = (from.address(), out.address());
-        let config = LaunchConfig { grid_dim: (checks.len() as u32, 1, 1), block_dim: (CHECK_BLOCK, 1, 1), shared_mem_bytes: 0 };
+        let block = if checks.len() < MANY_CHECKS { CHECK_BLOCK } else { SMALL_CHECK_BLOCK };
+        let config = LaunchConfig { grid_dim: (checks.len() as u32, 1, 1), block_dim: (block, 1, 1), shared_mem_bytes: 0 };
         let mut call = gpu.work().launch_builder(&self.kernels.checks);
         call.arg(&parameters).arg(&argument).arg(&given).arg(&found);
         // SAFETY: the arguments of `march_checks`; both arrays have an entry for each block.
