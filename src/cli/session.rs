@@ -8,7 +8,9 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, Peers, PublishError, PublishSettings, RunFolder, Summary};
+use ridgewatch::publish::{
+    DEFAULT_ENDPOINT, FileStatistics, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
+};
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
 use ridgewatch::steer::CommandSocket;
@@ -159,9 +161,15 @@ impl Session<'_> {
         if let Some(commands) = &commands {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
+        let newest = Arc::new(NewestFrame::new(&out));
         let shown = options.dashboard.zip(output.endpoint());
-        let _dashboard =
-            shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port, commands.as_ref().map(CommandSocket::connection)));
+        let dashboard = shown.and_then(|(port, endpoint)| {
+            let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
+            dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest))
+        });
+        if dashboard.is_some() {
+            output.keep_newest(newest);
+        }
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,

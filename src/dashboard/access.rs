@@ -92,7 +92,12 @@ impl Access {
 
 /// The token of a request, right or wrong.
 pub(super) fn given_token(uri: &Uri) -> Option<&str> {
-    uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix("token="))
+    parameter(uri, "token")
+}
+
+/// A value of the query. Those of this server need no escapes.
+pub(super) fn parameter<'a>(uri: &'a Uri, name: &str) -> Option<&'a str> {
+    uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix(name)?.strip_prefix('='))
 }
 
 /// Value of a header that may come once.

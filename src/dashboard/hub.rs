@@ -1,5 +1,6 @@
 //! What all browsers share: the newest picture, the latest records, the state of the publisher.
 
+use super::pixels::{Kept, Pixels};
 use super::steering::{Answer, Reach, Wheel};
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
 use bytes::Bytes;
@@ -55,6 +56,7 @@ pub(super) struct Hub {
     clients: Mutex<Clients>,
     /// For commands of the browsers.
     pub wheel: Wheel,
+    pub pixels: Pixels,
 }
 
 /// The latest records, as JSON.
@@ -140,6 +142,7 @@ struct State<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     problem: Option<String>,
     steering: Reach,
+    values: Kept<'a>,
     /// Token that only watches, for pages that may steer.
     #[serde(skip_serializing_if = "Option::is_none")]
     token_to_share: Option<&'a str>,
@@ -153,10 +156,11 @@ struct Head {
 }
 
 impl Hub {
-    pub fn new(endpoint: String, wheel: Wheel) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels) -> Self {
         Self {
             endpoint,
             wheel,
+            pixels,
             server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
             recorded: watch::Sender::new(0),
@@ -305,6 +309,7 @@ impl Hub {
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
             steering: self.wheel.reach_for(token_to_share.is_some()),
+            values: self.pixels.kept(),
             token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
@@ -415,7 +420,7 @@ mod tests {
 
     #[test]
     fn those_who_watch_push_out_nobody_who_steers() {
-        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0));
+        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None)));
         let steering = hub.enter(true);
         let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
         assert_eq!(left(&hub).len(), MAX_CLIENTS);

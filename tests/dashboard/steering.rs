@@ -20,7 +20,7 @@ fn command_socket(folder: &Path) -> CommandSocket {
 fn stage() -> Stage {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("commands.connection");
-    Stage::with(folder, Some(file))
+    Stage::with(folder, Some(file), None)
 }
 
 fn answer(visitor: &mut Visitor, number: u64, set: Value) -> Value {
