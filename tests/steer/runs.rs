@@ -5,6 +5,8 @@ use crate::kit::scene::{double_gyre, setup, write};
 use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
+use std::collections::HashSet;
+use std::os::unix::fs::MetadataExt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -202,4 +204,50 @@ async fn the_program_is_steered_by_its_connection_file_alone() {
     assert!(!file.exists(), "the key goes with the run");
     let mut replay = ridgewatch(["replay", &scene, "--steer=udp://127.0.0.1:1", "--out", text(&folder.path().join("no"))]);
     crate::kit::program::run(&mut replay).refused(2, &["udp://127.0.0.1:1", "neither tcp:// nor ipc://"]);
+}
+
+/// Those that end in the pause are heard, so that others follow: at first only the one on its way ended.
+#[test]
+fn checkpoints_go_on_in_a_pause() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("weights");
+    let network = "surrogate.kind = \"network\"\nnetwork.levels = 2\nnetwork.log2_table = 8\nnetwork.width = 16\nnetwork.batch = 64\n";
+    let keys =
+        format!("time.tau = 10\nflow.steps = 20\ntime.slides = 5\ntraining.steps_per_frame = 1\nrender.method = \"gated\"\n{network}");
+    let setup = setup(&double_gyre([24, 12, 1], &keys), &[]);
+    let steering = Arc::new(Steering::new(&setup.plan));
+    let options = RunOptions {
+        steering: Some(Arc::clone(&steering)),
+        checkpoint: Some(path.clone()),
+        checkpoint_seconds: Some(0.05),
+        threads: 2,
+        ..RunOptions::default()
+    };
+    let (stop, mut last) = (AtomicBool::new(false), 0);
+    let report = std::thread::scope(|scope| {
+        let mut sink = |event: Event| {
+            let Event::Frame(frame) = event else { return };
+            last = frame.record.frame;
+            match last {
+                0 => command(&steering, json!({"paused": true})),
+                // The last frame of the pause. Each checkpoint is another file.
+                32 => {
+                    let (path, stop) = (&path, &stop);
+                    scope.spawn(move || {
+                        let (mut files, end) = (HashSet::new(), Instant::now() + Duration::from_secs(60));
+                        while files.len() < 4 && Instant::now() < end {
+                            files.extend(path.metadata().map(|about| (about.ino(), about.mtime_nsec())));
+                            std::thread::sleep(Duration::from_millis(5));
+                        }
+                        stop.store(true, Ordering::Relaxed);
+                        assert!(files.len() >= 4, "{files:?}");
+                    });
+                }
+                _ => {}
+            }
+        };
+        run(setup, &options, &mut sink, &stop).unwrap()
+    });
+    let totals = report.checkpoints.unwrap();
+    assert!(last == 32 && totals.failed == 0 && totals.written >= 4, "{totals:?}");
 }
