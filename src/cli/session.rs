@@ -13,7 +13,7 @@ use ridgewatch::publish::{
 };
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
-use ridgewatch::steer::CommandSocket;
+use ridgewatch::steer::{CommandSocket, SteerError};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -42,9 +42,9 @@ pub struct RunArguments {
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
     dashboard: Option<Option<u16>>,
     /// Accept signed commands (camera, tolerance, colours, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
-    /// which is printed, holds the key. With --dashboard its page steers.
-    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_ENDPOINT)]
-    steer: Option<String>,
+    /// which is printed, holds the key. With --dashboard its page steers, and without ENDPOINT another one is taken if private is in use.
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true)]
+    steer: Option<Option<String>>,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
@@ -143,8 +143,10 @@ impl Session<'_> {
         let mut publish = scene.publish_settings();
         let started = if options.dashboard.is_some() { start_shown(&mut publish) } else { Output::start(&publish, None) };
         let mut output = started.map_err(|error| located(&scene, error, PublishError::refused))?;
-        let steering = options.steer.as_ref().map(|endpoint| (endpoint, Arc::new(Steering::new(&setup.plan))));
-        let commands = steering.as_ref().map(|(endpoint, steering)| CommandSocket::bind(endpoint, Arc::clone(steering))).transpose()?;
+        let steering = options.steer.as_ref().map(|_| Arc::new(Steering::new(&setup.plan)));
+        let named = options.steer.iter().flatten().next();
+        let listen = |steering| listen(named.map(String::as_str), options.dashboard.is_some(), steering);
+        let commands = steering.as_ref().map(listen).transpose()?;
         let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
         if out != options.out {
@@ -178,7 +180,7 @@ impl Session<'_> {
             checkpoint_seconds: following.as_ref().map(|following| following.checkpoint_seconds),
             resume_if_fit: following.and_then(|following| following.resume_if_fit),
             device,
-            steering: steering.map(|(_, steering)| steering),
+            steering,
             abandon: stop.abandoned.clone(),
         };
         let (result, last, summary) = work(setup, &scene, &run_options, output, &stop.requested);
@@ -228,6 +230,15 @@ fn start_shown(publish: &mut PublishSettings) -> Result<Output, PublishError> {
         messages::note("no frames for the dashboard: neither the private endpoint nor another one is free (--publish names one)");
     }
     Output::start(publish, None)
+}
+
+/// Binds the command socket. One that no endpoint is named for, and whose page finds it, costs no run: another one may listen at the private one.
+fn listen(named: Option<&str>, is_shown: bool, steering: &Arc<Steering>) -> Result<CommandSocket, SteerError> {
+    let bind = |endpoint| CommandSocket::bind(endpoint, Arc::clone(steering));
+    match bind(named.unwrap_or(DEFAULT_ENDPOINT)) {
+        Err(error) if named.is_none() && is_shown && error.is_in_use() => bind("tcp://127.0.0.1:0"),
+        bound => bound,
+    }
 }
 
 /// Runs the cycle on the calling thread. Whatever happens, completes the output of the frames made so far.
