@@ -1,5 +1,6 @@
 //! What all browsers share: the newest picture, the latest records, the state of the publisher.
 
+use super::metrics::{Metrics, Server};
 use super::pixels::{Kept, Pixels};
 use super::steering::{Answer, Reach, Wheel};
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
@@ -53,6 +54,7 @@ pub(super) struct Hub {
     pub recorded: watch::Sender<u64>,
     records: Mutex<Records>,
     health: Mutex<Health>,
+    metrics: Mutex<Metrics>,
     clients: Mutex<Clients>,
     /// For commands of the browsers.
     pub wheel: Wheel,
@@ -166,6 +168,7 @@ impl Hub {
             recorded: watch::Sender::new(0),
             records: Mutex::default(),
             health: Mutex::default(),
+            metrics: Mutex::default(),
             clients: Mutex::default(),
         }
     }
@@ -249,6 +252,7 @@ impl Hub {
         }
         let (record, Numbered { seconds, .. }) = checked(json)?;
         lock(&self.health).note_record(Instant::now(), seconds.and_then(|seconds| seconds.total));
+        lock(&self.metrics).take(record);
         lock(&self.records).keep(record.into());
         self.recorded.send_modify(|count| *count += 1);
         Ok(())
@@ -293,6 +297,12 @@ impl Hub {
         let json =
             format!(r#"{{"kind":"records","server":{server:?},"first":{first},"records":[{}],"skipped":{skipped}}}"#, batch.join(","));
         Some((message(&json, &[]), next))
+    }
+
+    /// Records and state of this server for Prometheus.
+    pub fn metrics(&self) -> String {
+        let server = Server { is_connected: lock(&self.health).is_connected, pages: lock(&self.clients).there.len() };
+        lock(&self.metrics).text(&server)
     }
 
     /// Message about the publisher, to a page that may steer if there is a token to share.

@@ -11,6 +11,7 @@ mod client;
 mod error;
 mod files;
 mod hub;
+mod metrics;
 mod pixels;
 mod server;
 mod steering;

@@ -3,7 +3,7 @@
 use super::access::{Access, Refused, given_token};
 use super::hub::Hub;
 use super::pixels::File;
-use super::{client, files};
+use super::{client, files, metrics};
 use axum::body::Body;
 use axum::extract::{FromRequestParts, Request, WebSocketUpgrade};
 use axum::http::header::{
@@ -137,6 +137,11 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
                 .on_upgrade(move |socket| client::serve(socket, hub, token_to_share)),
             Err(rejection) => rejection.into_response(),
         });
+    }
+    if path.ends_with("/metrics") {
+        access.check_origin(&parts.headers)?;
+        access.check_token_or_bearer(&parts.uri, &parts.headers)?;
+        return Ok(([(CONTENT_TYPE, metrics::MEDIA_TYPE)], hub.metrics()).into_response());
     }
     let asks_for = File::named(path);
     if path.ends_with("/values") || asks_for.is_some() {

@@ -3,6 +3,7 @@
 
 #[path = "../kit/mod.rs"]
 mod kit;
+mod metrics;
 mod program;
 mod steering;
 mod values;
