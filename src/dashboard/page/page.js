@@ -237,7 +237,10 @@ function showSteering() {
   setText(element("obstacle"), obstacle ?? "");
   setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
   element("pause").setAttribute("aria-pressed", String(steering.paused));
-  const values = { tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  const { method, budget } = steering.ready ?? {};
+  if (document.activeElement !== element("method")) element("method").value = method ?? "";
+  element("budget").disabled = method !== "two_level";
+  const values = { budget, tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
@@ -298,7 +301,7 @@ const KEYS = {
 
 function pressKey(event) {
   const { key, target } = event;
-  const types = target.matches("input[type=number]");
+  const types = target.matches("input[type=number], select");
   const used = types || event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
   if (used || KEYS[key] === undefined) return;
   event.preventDefault();
@@ -316,13 +319,21 @@ document.addEventListener("keydown", pressKey);
 steerBy(element("frame"), steering);
 const point = (event) => values.point(pixelAt(event, pictureBox(element("frame")), [element("frame").width, element("frame").height]), heldFrame());
 for (const type of ["pointermove", "pointerdown"]) element("frame").addEventListener(type, (event) => picture.shown && point(event));
-element("frame").addEventListener("pointerleave", () => values.point(null, null));
+// A finger that is lifted leaves the value of its pixel.
+element("frame").addEventListener("pointerleave", (event) => event.pointerType === "touch" || values.point(null, null));
 for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", () => save(button.dataset.save));
 element("pause").addEventListener("click", () => steering.togglePause());
 element("home").addEventListener("click", () => steering.home());
 element("share").addEventListener("click", share);
-element("tolerance").addEventListener("change", ({ target }) => {
-  if (Number.isFinite(target.valueAsNumber)) steering.command({ "trust.tolerance": target.valueAsNumber });
+for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.budget"]]) {
+  element(id).addEventListener("change", ({ target }) => {
+    if (Number.isFinite(target.valueAsNumber)) steering.command({ [key]: target.valueAsNumber });
+  });
+}
+element("method").addEventListener("change", ({ target }) => {
+  steering.command({ "render.method": target.value });
+  // Its keys are shortcuts again, and a method that is refused is not shown.
+  target.blur();
 });
 for (const id of ["low", "high"]) {
   element(id).addEventListener("change", () => {
