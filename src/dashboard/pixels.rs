@@ -17,7 +17,7 @@ const MAX_PIXELS: usize = 1 << 24;
 /// Files that are encoded or on their way at once. Each may be large.
 const MAX_DOWNLOADS: usize = 1;
 
-const ELSEWHERE: &str = "this dashboard runs beside the run, which keeps its frames to itself; with --dashboard the run serves them";
+const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
 
 /// What is served of the pixels, as a page is told.
 #[derive(Debug, Serialize)]

@@ -40,6 +40,7 @@ async function open(address) {
 }
 
 const line = (page) => page.textContent("#values");
+const fits = (page) => page.$eval("#values", (node) => node.scrollWidth <= node.clientWidth && node.clientHeight < 2 * Number.parseFloat(getComputedStyle(node).lineHeight));
 const number = async (page) => Number((await page.textContent("#position")).replace(/\D/g, ""));
 
 /** Puts the pointer on a pixel. */
@@ -71,8 +72,7 @@ test("the value follows the pointer and the run, and does not wrap", async () =>
   await until("a value", async () => /^frame [\d,]+ at 40, 20: .*colour [\d.]+ [\d.]+ [\d.]+ ± [\d.e−]+, alpha [\d.]+$/.test(await line(page)));
   const first = await line(page);
   await until("that of a later frame", async () => (await line(page)) !== first && /at 40, 20/.test(await line(page)));
-  const fits = () => page.$eval("#values", (node) => node.scrollWidth <= node.clientWidth && node.clientHeight < 2 * Number.parseFloat(getComputedStyle(node).lineHeight));
-  assert.ok(await fits());
+  assert.ok(await fits(page));
   // A long run at the largest size that is usual.
   const channels = { R: 0.000123, G: 0.000456, B: 0.000789, A: 0.987, error: 0.00012, "ftle.mean": -0.000123 };
   const longest = valueWords({ frame: 1_234_567, x: 3839, y: 2159, unit: "1/snapshots", channels });
@@ -80,7 +80,7 @@ test("the value follows the pointer and the run, and does not wrap", async () =>
   await until("the pointer has left", async () => /^Point/.test(await line(page)));
   await page.evaluate(() => { document.getElementById("values").id = "still"; const twin = document.getElementById("still").cloneNode(); twin.id = "values"; document.getElementById("still").after(twin); });
   await page.$eval("#values", (node, text) => { node.textContent = text; }, longest);
-  assert.ok(await fits(), longest);
+  assert.ok(await fits(page), longest);
   assert.deepEqual(complaints, []);
   await page.context().close();
 });
@@ -116,6 +116,7 @@ test("of an earlier frame it is said that its values are gone", async () => {
   await point(page, [5, 5]);
   const gone = new RegExp(`frame ${held} is no longer kept: the run keeps its newest one, \\d+ by now`);
   await until("it is said", async () => gone.test(await line(page)));
+  assert.ok(await fits(page));
   await page.click('[data-save="exr"]');
   await until("it is said", async () => gone.test(await page.textContent("#warnings")));
   // The picture and the record are here.
@@ -129,8 +130,9 @@ test("of an earlier frame it is said that its values are gone", async () => {
 
 test("a dashboard beside the run says that it has no values", async () => {
   const page = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
-  const why = /this dashboard runs beside the run, which keeps its frames to itself; with --dashboard the run serves them/;
+  const why = /this dashboard runs beside the run; with --dashboard the run serves them/;
   await until("it is said", async () => why.test(await line(page)));
+  assert.ok(await fits(page));
   await point(page, [5, 5]);
   await page.click('[data-save="exr"]');
   await until("it is said", async () => /No EXR: /.test(await page.textContent("#warnings")) && why.test(await page.textContent("#warnings")));
