@@ -325,7 +325,7 @@ mod tests {
             (json!({"render.method": "auto"}), "`render.method` is \"auto\"; accepted: reference, surrogate, gated, marched or two_level"),
             (json!({"render.method": "exact"}), "`render.method` is \"exact\"; accepted: reference, surrogate"),
             (json!({"render.budget": 0.01}), "`render.budget` is 0.01; accepted: milliseconds, 0.1 to 600000"),
-            (json!({"render.budget": null}), "`render.budget` is null; accepted: milliseconds"),
+            (json!({"render.budget": "fast"}), "`render.budget` is \"fast\"; accepted: milliseconds"),
             (
                 json!({"render.budget": 50, "render.method": "gated"}),
                 "`render.budget` is 50 with render.method = \"gated\"; accepted: a budget",
