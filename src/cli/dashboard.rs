@@ -4,10 +4,11 @@ use super::common::{Common, Usage, print_json, print_text};
 use super::messages;
 use anyhow::{Result, bail};
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
-use ridgewatch::publish::DEFAULT_ENDPOINT;
+use ridgewatch::publish::{DEFAULT_ENDPOINT, NewestFrame};
 use ridgewatch::steer::default_connection;
 use std::net::{IpAddr, Ipv4Addr};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Options of `dashboard`.
@@ -43,7 +44,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let steer = steer.map(|file| file.map_or_else(default_connection, Ok)).transpose()?;
     let token = token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
     let is_steered = steer.is_some();
-    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer })?;
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer, newest: None })?;
     if !address.is_loopback() {
         messages::note(format_args!(
             "{} is open to other machines: without encryption, whoever reads the network sees frames and token",
@@ -64,15 +65,16 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     })
 }
 
-/// Starts a dashboard beside a run that publishes at `endpoint`, and takes commands if it has a connection file. Without one the run goes on.
-pub fn beside(common: &Common, endpoint: &str, port: Option<u16>, steer: Option<&Path>) -> Option<Dashboard> {
+/// Starts a dashboard beside a run that publishes at `endpoint`, keeps its newest frame, and takes commands if it has a connection file. Without one
+/// the run goes on.
+pub fn beside(common: &Common, endpoint: String, port: Option<u16>, steer: Option<PathBuf>, newest: Arc<NewestFrame>) -> Option<Dashboard> {
+    let is_steered = steer.is_some();
     let started = Token::random().map_err(Into::into).and_then(|token| {
-        let settings = DashboardSettings::local(endpoint.to_owned(), port, token);
-        Dashboard::start(DashboardSettings { steer: steer.map(Path::to_owned), ..settings })
+        Dashboard::start(DashboardSettings { steer, newest: Some(newest), ..DashboardSettings::local(endpoint, port, token) })
     });
     match started {
         Ok(dashboard) => {
-            if let Err(error) = announce(&dashboard, common.json, false, steer.is_some()) {
+            if let Err(error) = announce(&dashboard, common.json, false, is_steered) {
                 messages::note(format_args!("the address of the dashboard cannot be printed: {error}"));
             }
             Some(dashboard)

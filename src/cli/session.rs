@@ -8,10 +8,12 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, Peers, PublishError, PublishSettings, RunFolder, Summary};
+use ridgewatch::publish::{
+    DEFAULT_ENDPOINT, FileStatistics, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
+};
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
-use ridgewatch::steer::CommandSocket;
+use ridgewatch::steer::{CommandSocket, SteerError};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -39,10 +41,10 @@ pub struct RunArguments {
     /// endpoint of --publish, or else where only this user reaches them.
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
     dashboard: Option<Option<u16>>,
-    /// Accept signed commands (camera, tolerance, colours, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
-    /// which is printed, holds the key. With --dashboard its page steers.
-    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_ENDPOINT)]
-    steer: Option<String>,
+    /// Accept signed commands (camera, tolerance, colours, method, budget, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
+    /// which is printed, holds the key. With --dashboard its page steers, and without ENDPOINT another one is taken if private is in use.
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true)]
+    steer: Option<Option<String>>,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
@@ -141,8 +143,10 @@ impl Session<'_> {
         let mut publish = scene.publish_settings();
         let started = if options.dashboard.is_some() { start_shown(&mut publish) } else { Output::start(&publish, None) };
         let mut output = started.map_err(|error| located(&scene, error, PublishError::refused))?;
-        let steering = options.steer.as_ref().map(|endpoint| (endpoint, Arc::new(Steering::new(&setup.plan))));
-        let commands = steering.as_ref().map(|(endpoint, steering)| CommandSocket::bind(endpoint, Arc::clone(steering))).transpose()?;
+        let steering = options.steer.as_ref().map(|_| Arc::new(Steering::new(&setup.plan)));
+        let named = options.steer.iter().flatten().next();
+        let listen = |steering| listen(named.map(String::as_str), options.dashboard.is_some(), steering);
+        let commands = steering.as_ref().map(listen).transpose()?;
         let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
         if out != options.out {
@@ -159,9 +163,15 @@ impl Session<'_> {
         if let Some(commands) = &commands {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
+        let newest = Arc::new(NewestFrame::new(&out));
         let shown = options.dashboard.zip(output.endpoint());
-        let _dashboard =
-            shown.and_then(|(port, endpoint)| dashboard::beside(common, endpoint, port, commands.as_ref().map(CommandSocket::connection)));
+        let dashboard = shown.and_then(|(port, endpoint)| {
+            let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
+            dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest))
+        });
+        if dashboard.is_some() {
+            output.keep_newest(newest);
+        }
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,
@@ -170,7 +180,7 @@ impl Session<'_> {
             checkpoint_seconds: following.as_ref().map(|following| following.checkpoint_seconds),
             resume_if_fit: following.and_then(|following| following.resume_if_fit),
             device,
-            steering: steering.map(|(_, steering)| steering),
+            steering,
             abandon: stop.abandoned.clone(),
         };
         let (result, last, summary) = work(setup, &scene, &run_options, output, &stop.requested);
@@ -220,6 +230,15 @@ fn start_shown(publish: &mut PublishSettings) -> Result<Output, PublishError> {
         messages::note("no frames for the dashboard: neither the private endpoint nor another one is free (--publish names one)");
     }
     Output::start(publish, None)
+}
+
+/// Binds the command socket. One that no endpoint is named for, and whose page finds it, costs no run: another one may listen at the private one.
+fn listen(named: Option<&str>, is_shown: bool, steering: &Arc<Steering>) -> Result<CommandSocket, SteerError> {
+    let bind = |endpoint| CommandSocket::bind(endpoint, Arc::clone(steering));
+    match bind(named.unwrap_or(DEFAULT_ENDPOINT)) {
+        Err(error) if named.is_none() && is_shown && error.is_in_use() => bind("tcp://127.0.0.1:0"),
+        bound => bound,
+    }
 }
 
 /// Runs the cycle on the calling thread. Whatever happens, completes the output of the frames made so far.

@@ -2,7 +2,7 @@
 
 use super::error::DashboardError;
 use super::token::Token;
-use axum::http::header::{HOST, HeaderMap, HeaderName, ORIGIN};
+use axum::http::header::{AUTHORIZATION, HOST, HeaderMap, HeaderName, ORIGIN};
 use axum::http::uri::{Authority, Uri};
 use std::net::{IpAddr, SocketAddr};
 
@@ -77,7 +77,16 @@ impl Access {
 
     /// What the token in the query allows. A cookie would go to all servers of this host, whatever their port.
     pub fn check_token(&self, uri: &Uri) -> Result<Rights, Refused> {
-        match given_token(uri) {
+        self.rights(given_token(uri))
+    }
+
+    /// As [`Self::check_token`]; programs may send the token as `Authorization: Bearer TOKEN`, which browsers never do by themselves.
+    pub fn check_token_or_bearer(&self, uri: &Uri, headers: &HeaderMap) -> Result<Rights, Refused> {
+        self.rights(given_token(uri).or_else(|| only(headers, AUTHORIZATION)?.strip_prefix("Bearer ")))
+    }
+
+    fn rights(&self, given: Option<&str>) -> Result<Rights, Refused> {
+        match given {
             Some(given) if self.token.is(given) => Ok(Rights::Steer),
             Some(given) if self.watching.is(given) => Ok(Rights::Watch),
             _ => Err(NO_TOKEN),
@@ -92,7 +101,12 @@ impl Access {
 
 /// The token of a request, right or wrong.
 pub(super) fn given_token(uri: &Uri) -> Option<&str> {
-    uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix("token="))
+    parameter(uri, "token")
+}
+
+/// A value of the query. Those of this server need no escapes.
+pub(super) fn parameter<'a>(uri: &'a Uri, name: &str) -> Option<&'a str> {
+    uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix(name)?.strip_prefix('='))
 }
 
 /// Value of a header that may come once.

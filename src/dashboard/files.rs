@@ -32,6 +32,7 @@ const FILES: &[File] = &[
     file!("protocol.js", SCRIPT),
     file!("steering.js", SCRIPT),
     file!("terms.js", SCRIPT),
+    file!("values.js", SCRIPT),
     file!("warnings.js", SCRIPT),
     file!("words.js", SCRIPT),
     file!("icon.svg", "image/svg+xml; charset=utf-8"),

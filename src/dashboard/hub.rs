@@ -1,5 +1,7 @@
 //! What all browsers share: the newest picture, the latest records, the state of the publisher.
 
+use super::metrics::{Metrics, Server};
+use super::pixels::{Kept, Pixels};
 use super::steering::{Answer, Reach, Wheel};
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
 use bytes::Bytes;
@@ -52,9 +54,11 @@ pub(super) struct Hub {
     pub recorded: watch::Sender<u64>,
     records: Mutex<Records>,
     health: Mutex<Health>,
+    metrics: Mutex<Metrics>,
     clients: Mutex<Clients>,
     /// For commands of the browsers.
     pub wheel: Wheel,
+    pub pixels: Pixels,
 }
 
 /// The latest records, as JSON.
@@ -140,6 +144,7 @@ struct State<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     problem: Option<String>,
     steering: Reach,
+    values: Kept<'a>,
     /// Token that only watches, for pages that may steer.
     #[serde(skip_serializing_if = "Option::is_none")]
     token_to_share: Option<&'a str>,
@@ -153,15 +158,17 @@ struct Head {
 }
 
 impl Hub {
-    pub fn new(endpoint: String, wheel: Wheel) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels) -> Self {
         Self {
             endpoint,
             wheel,
+            pixels,
             server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
             recorded: watch::Sender::new(0),
             records: Mutex::default(),
             health: Mutex::default(),
+            metrics: Mutex::default(),
             clients: Mutex::default(),
         }
     }
@@ -245,6 +252,7 @@ impl Hub {
         }
         let (record, Numbered { seconds, .. }) = checked(json)?;
         lock(&self.health).note_record(Instant::now(), seconds.and_then(|seconds| seconds.total));
+        lock(&self.metrics).take(record);
         lock(&self.records).keep(record.into());
         self.recorded.send_modify(|count| *count += 1);
         Ok(())
@@ -291,6 +299,12 @@ impl Hub {
         Some((message(&json, &[]), next))
     }
 
+    /// Records and state of this server for Prometheus.
+    pub fn metrics(&self) -> String {
+        let server = Server { is_connected: lock(&self.health).is_connected, pages: lock(&self.clients).there.len() };
+        lock(&self.metrics).text(&server)
+    }
+
     /// Message about the publisher, to a page that may steer if there is a token to share.
     pub fn state(&self, token_to_share: Option<&str>) -> Bytes {
         let clients = lock(&self.clients).there.len();
@@ -305,6 +319,7 @@ impl Hub {
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
             steering: self.wheel.reach_for(token_to_share.is_some()),
+            values: self.pixels.kept(),
             token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
@@ -415,7 +430,7 @@ mod tests {
 
     #[test]
     fn those_who_watch_push_out_nobody_who_steers() {
-        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0));
+        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None)));
         let steering = hub.enter(true);
         let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
         assert_eq!(left(&hub).len(), MAX_CLIENTS);

@@ -3,7 +3,7 @@
 //! In: the messages of a publisher, over ZeroMQ, and commands of browsers. Out: one page and a WebSocket, over HTTP, and the commands to the run.
 //! Calls `publish` for the names of messages, `steer` for commands, and the crate `ridgewatch-zmtp`.
 //!
-//! One thread does all of it. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
+//! One thread does all of it but the encoding of files. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
 //! that none waits for another one and no queue grows behind it.
 
 mod access;
@@ -11,6 +11,8 @@ mod client;
 mod error;
 mod files;
 mod hub;
+mod metrics;
+mod pixels;
 mod server;
 mod steering;
 mod token;
@@ -18,8 +20,10 @@ mod token;
 pub use error::DashboardError;
 pub use token::Token;
 
+use crate::publish::NewestFrame;
 use access::Access;
 use hub::Hub;
+use pixels::Pixels;
 use ridgewatch_zmtp::{check_endpoint, private_endpoint};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
@@ -50,12 +54,14 @@ pub struct DashboardSettings {
     pub token: Token,
     /// Connection file of the run's command socket; `None`: pages only watch.
     pub steer: Option<PathBuf>,
+    /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own.
+    pub newest: Option<Arc<NewestFrame>>,
 }
 
 impl DashboardSettings {
     /// Serves this machine only, with these frames, to those who watch.
     pub fn local(endpoint: String, port: Option<u16>, token: Token) -> Self {
-        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None }
+        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None, newest: None }
     }
 }
 
@@ -76,7 +82,7 @@ impl Dashboard {
     /// # Errors
     /// An endpoint or a name of a host that is not accepted, a port in use, or an error of the system.
     pub fn start(settings: DashboardSettings) -> Result<Self, DashboardError> {
-        let DashboardSettings { endpoint, address, port, hosts, token, steer } = settings;
+        let DashboardSettings { endpoint, address, port, hosts, token, steer, newest } = settings;
         let endpoint = match endpoint.as_str() {
             crate::publish::DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|source| DashboardError::Private { source })?,
             _ => endpoint,
@@ -86,8 +92,8 @@ impl Dashboard {
         let address = listener.local_addr()?;
         let access = Access::new(token.clone(), hosts, address)?;
         let (wheel, requests) = Wheel::new(steer);
-        let hub = Arc::new(Hub::new(endpoint.clone(), wheel));
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
+        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest)));
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(2).build()?;
         let listener = {
             let _inside = runtime.enter();
             tokio::net::TcpListener::from_std(listener)?

@@ -2,11 +2,13 @@
 
 use super::access::{Access, Refused, given_token};
 use super::hub::Hub;
-use super::{client, files};
+use super::pixels::File;
+use super::{client, files, metrics};
 use axum::body::Body;
 use axum::extract::{FromRequestParts, Request, WebSocketUpgrade};
 use axum::http::header::{
-    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
+    ALLOW, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, REFERRER_POLICY,
+    TRANSFER_ENCODING, X_CONTENT_TYPE_OPTIONS,
 };
 use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
@@ -14,7 +16,9 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use std::convert::Infallible;
+use std::pin::pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
@@ -26,6 +30,8 @@ const MAX_CONNECTIONS: usize = 128;
 const HEAD_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time after which an HTTP connection ends, also of a browser that does not read. A browser opens the next one by itself.
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(60);
+/// Further time of one on which a file is sent.
+const DOWNLOAD_TIMEOUT: Duration = Duration::from_secs(600);
 /// Maximum length of the head of a request, in bytes, and number of its fields.
 const MAX_HEAD_BYTES: usize = 16 << 10;
 const MAX_HEAD_FIELDS: usize = 64;
@@ -57,19 +63,27 @@ pub(super) async fn serve(listener: TcpListener, access: Access, hub: Arc<Hub>) 
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
         let (access, hub) = (Arc::clone(&access), Arc::clone(&hub));
         tokio::spawn(async move {
-            let _ = timeout(CONNECTION_TIMEOUT, connection(stream, access, hub)).await;
+            let downloads = AtomicBool::new(false);
+            let mut connection = pin!(connection(stream, &access, &hub, &downloads));
+            if timeout(CONNECTION_TIMEOUT, &mut connection).await.is_err() && downloads.load(Ordering::Relaxed) {
+                let _ = timeout(DOWNLOAD_TIMEOUT, connection).await;
+            }
             drop(place);
         });
     }
 }
 
-/// Answers the requests of a connection, until it ends or becomes a WebSocket.
-async fn connection(stream: TcpStream, access: Arc<Access>, hub: Arc<Hub>) {
+/// Answers the requests of a connection, until it ends or becomes a WebSocket. Notes whether a file was asked for.
+async fn connection(stream: TcpStream, access: &Access, hub: &Arc<Hub>, downloads: &AtomicBool) {
     // Small messages follow large ones.
     let _ = stream.set_nodelay(true);
-    let service = service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
-        let (access, hub) = (Arc::clone(&access), Arc::clone(&hub));
-        async move { Ok::<_, Infallible>(answer(request.map(Body::new), &access, hub).await) }
+    let service = service_fn(|request: hyper::Request<hyper::body::Incoming>| async {
+        let is_file = File::named(request.uri().path()).is_some();
+        let response = answer(request.map(Body::new), access, Arc::clone(hub)).await;
+        if is_file && response.status().is_success() {
+            downloads.store(true, Ordering::Relaxed);
+        }
+        Ok::<_, Infallible>(response)
     });
     let served = http1::Builder::new()
         .timer(TokioTimer::new())
@@ -101,6 +115,9 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
     if parts.method != Method::GET && parts.method != Method::HEAD {
         return Ok((StatusCode::METHOD_NOT_ALLOWED, [(ALLOW, "GET, HEAD")]).into_response());
     }
+    if has_body(&parts.headers) {
+        return Ok((StatusCode::PAYLOAD_TOO_LARGE, "The request has a body; accepted: requests without one.\n").into_response());
+    }
     let path = parts.uri.path();
     if path.ends_with('/') {
         // The page holds no data: without a token it says how to get one. It learns here why a WebSocket was refused.
@@ -121,10 +138,29 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
             Err(rejection) => rejection.into_response(),
         });
     }
+    if path.ends_with("/metrics") {
+        access.check_origin(&parts.headers)?;
+        access.check_token_or_bearer(&parts.uri, &parts.headers)?;
+        return Ok(([(CONTENT_TYPE, metrics::MEDIA_TYPE)], hub.metrics()).into_response());
+    }
+    let asks_for = File::named(path);
+    if path.ends_with("/values") || asks_for.is_some() {
+        access.check_origin(&parts.headers)?;
+        access.check_token(&parts.uri)?;
+        return Ok(match asks_for {
+            Some(file) => hub.pixels.download(file, &parts.uri).await,
+            None => hub.pixels.values(&parts.uri),
+        });
+    }
     Ok(match files::named(path) {
         Some(found) => file(found).into_response(),
         None => (StatusCode::NOT_FOUND, "There is no such file.\n").into_response(),
     })
+}
+
+/// Whether more than a head comes.
+fn has_body(headers: &HeaderMap) -> bool {
+    headers.contains_key(TRANSFER_ENCODING) || headers.get_all(CONTENT_LENGTH).iter().any(|length| length.as_bytes() != b"0")
 }
 
 fn file(file: files::File) -> impl IntoResponse {

@@ -14,6 +14,28 @@ const LAYERS: [&str; 7] = ["ftle.mean", "trust.traced", "variance", "samples.cou
 /// Maximum number of samples of all channels of a file that is read, so that a damaged header cannot ask for all memory.
 const MAX_SAMPLES: usize = 1 << 30;
 
+/// The layers of a film by name.
+fn layers(film: &Film) -> [(&'static str, &Vec<f32>); 7] {
+    let [ftle, traced, variance, samples, missing, queries, error] = LAYERS;
+    [
+        (ftle, &film.ftle_mean),
+        (traced, &film.traced),
+        (variance, &film.variance),
+        (samples, &film.samples),
+        (missing, &film.missing),
+        (queries, &film.queries),
+        (error, &film.error),
+    ]
+}
+
+/// Values of the channels of a film's EXR at a pixel, by name. Outside of the film there are none.
+pub fn channels_at(film: &Film, [x, y]: [usize; 2]) -> Vec<(&'static str, f32)> {
+    let Some(pixel) = (x < film.width && y < film.height).then_some(y * film.width + x) else { return Vec::new() };
+    let colours = film.rgba.get(pixel).into_iter().flat_map(|rgba| ["R", "G", "B", "A"].into_iter().zip(*rgba));
+    let values = layers(film).into_iter().filter_map(|(name, layer)| Some((name, *layer.get(pixel)?)));
+    colours.chain(values).collect()
+}
+
 /// Encodes the film as an EXR file. The record goes into the attributes `ridgewatch.frame`, `ridgewatch.time` and `ridgewatch.record` (JSON).
 /// Layers without entries are left out.
 ///
@@ -26,8 +48,7 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     }
     let colour = |k: usize| film.rgba.iter().map(|p| p[k]).collect::<Vec<f32>>();
     let mut channels = vec![("R", colour(0)), ("G", colour(1)), ("B", colour(2)), ("A", colour(3))];
-    let layers = [&film.ftle_mean, &film.traced, &film.variance, &film.samples, &film.missing, &film.queries, &film.error];
-    for (name, layer) in LAYERS.into_iter().zip(layers) {
+    for (name, layer) in layers(film) {
         match layer.len() {
             0 => {}
             n if n == pixels => channels.push((name, layer.clone())),

@@ -8,6 +8,7 @@ mod error;
 mod exr;
 mod file_writer;
 mod message;
+mod newest;
 mod output;
 mod preview;
 mod run_folder;
@@ -18,8 +19,9 @@ mod zmq;
 
 pub use compare::{CompareError, Comparison, compare_files, compare_films};
 pub use error::PublishError;
-pub use exr::{decode_exr, encode_exr, read_exr, write_exr};
+pub use exr::{channels_at, decode_exr, encode_exr, read_exr, write_exr};
 pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
+pub use newest::{NewestFrame, NoFrame};
 pub use output::Output;
 pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};

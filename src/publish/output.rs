@@ -2,11 +2,13 @@
 
 use super::error::PublishError;
 use super::file_writer::FileWriter;
+use super::newest::NewestFrame;
 use super::run_folder::RunFolder;
 use super::settings::PublishSettings;
 use super::summary::{Summary, Totals, peak_memory_bytes};
 use super::zmq::Publisher;
 use crate::run::Frame;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Longest wait at the end of a run for subscribers to receive the last frame.
@@ -17,6 +19,7 @@ const LINGER: Duration = Duration::from_millis(500);
 pub struct Output {
     files: Option<FileWriter>,
     publisher: Option<Publisher>,
+    newest: Option<Arc<NewestFrame>>,
     totals: Totals,
     frames: u64,
     started: Instant,
@@ -31,7 +34,7 @@ impl Output {
         settings.check()?;
         let publisher = settings.endpoint.as_deref().map(|endpoint| Publisher::start(endpoint, settings)).transpose()?;
         let (totals, frames, started) = (Totals::default(), 0, Instant::now());
-        let mut output = Self { files: None, publisher, totals, frames, started };
+        let mut output = Self { files: None, publisher, newest: None, totals, frames, started };
         folder.map_or(Ok(()), |folder| output.write_to(folder, settings))?;
         Ok(output)
     }
@@ -45,6 +48,11 @@ impl Output {
         Ok(())
     }
 
+    /// Keeps the newest frame in memory from now on.
+    pub fn keep_newest(&mut self, newest: Arc<NewestFrame>) {
+        self.newest = Some(newest);
+    }
+
     /// Endpoint of the socket, with the port that was bound. `None` without a socket.
     pub fn endpoint(&self) -> Option<&str> {
         self.publisher.as_ref().map(Publisher::endpoint)
@@ -54,6 +62,10 @@ impl Output {
     pub fn frame(&mut self, frame: Frame) {
         self.frames += 1;
         self.totals.add(&frame.record);
+        // Before it is published, so that it is there when it is seen.
+        if let Some(newest) = &self.newest {
+            newest.put(frame.clone());
+        }
         if let Some(publisher) = &self.publisher {
             publisher.frame(frame.clone());
         }

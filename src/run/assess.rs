@@ -85,7 +85,7 @@ impl Run<'_> {
                 .warnings
                 .push(format!("the tracing budget was spent: {over_budget} queries of untrusted cells were answered by the surrogate"));
         }
-        if self.plan.scene.render.method == Method::Gated
+        if self.render.method == Method::Gated
             && let Some(error) = trusted
         {
             let evidence = learning.trust.weigh(&error);

@@ -36,6 +36,8 @@ pub(super) struct Checkpoints {
     due: Instant,
     limit: Duration,
     writing: Option<Writing>,
+    /// The newest that ended without being told of, for the next record.
+    ended: Option<CheckpointRecord>,
     totals: CheckpointTotals,
 }
 
@@ -57,7 +59,7 @@ impl Drop for Checkpoints {
 
 impl Checkpoints {
     pub(super) fn new(path: PathBuf, every: Option<f64>) -> Self {
-        Self { path, every, due: Instant::now(), limit: DISK_LIMIT, writing: None, totals: CheckpointTotals::default() }
+        Self { path, every, due: Instant::now(), limit: DISK_LIMIT, writing: None, ended: None, totals: CheckpointTotals::default() }
     }
 
     /// Totals so far.
@@ -65,13 +67,17 @@ impl Checkpoints {
         &self.totals
     }
 
-    /// Starts a checkpoint after `frame`, if one is due. Returns the pause of the loop in seconds, and a warning if frames had to wait.
+    /// Starts a checkpoint after `frame`, if one is due and the one before has ended. Returns the pause of the loop in seconds, and a warning if frames had to wait.
     ///
     /// # Errors
     /// The device fails.
     pub(super) fn after_frame<S: Surrogate>(&mut self, frame: u64, live: &mut S) -> Result<(f64, Option<String>), DeviceError> {
         if self.every.is_none_or(|seconds| self.due.elapsed().as_secs_f64() < seconds) {
             return Ok((0.0, None));
+        }
+        // In a pause no frame looks.
+        if let Some((record, _)) = self.hear(Duration::ZERO) {
+            self.ended = Some(record);
         }
         if let Some(writing) = &mut self.writing {
             self.due = Instant::now();
@@ -112,7 +118,8 @@ impl Checkpoints {
 
     /// Record of the checkpoint in progress since the last frame, complete or partial; `None` without one.
     pub(super) fn look(&mut self) -> Option<CheckpointRecord> {
-        self.hear(Duration::ZERO).map_or_else(|| self.under_way(), |(record, _)| Some(record))
+        let ended = self.ended.take().or_else(|| self.hear(Duration::ZERO).map(|(record, _)| record));
+        ended.or_else(|| self.under_way())
     }
 
     fn under_way(&self) -> Option<CheckpointRecord> {
@@ -223,6 +230,24 @@ mod tests {
         assert!(result.is_ok() && record.frame == Some(6) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()));
         checkpoints.finish(Some(7), &table).unwrap();
         assert_eq!((checkpoints.totals.written, checkpoints.totals.failed, checkpoints.totals.postponed), (3, 0, 5));
+    }
+
+    #[test]
+    fn without_frames_the_end_of_one_is_heard_and_told_by_the_next_record() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut checkpoints, end) = slow(folder.path());
+        let mut table = table();
+        checkpoints.after_frame(1, &mut table).unwrap();
+        assert_eq!((checkpoints.totals.postponed, checkpoints.totals.written), (1, 0));
+        end.send(Ok(77)).unwrap();
+        let until = Instant::now() + DISK_LIMIT;
+        while checkpoints.totals.written < 3 {
+            assert!(Instant::now() < until, "{:?}", checkpoints.totals);
+            checkpoints.after_frame(1, &mut table).unwrap();
+        }
+        let record = checkpoints.look().unwrap();
+        assert!(record.frame == Some(1) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()), "{record:?}");
+        checkpoints.finish(Some(1), &table).unwrap();
     }
 
     #[test]

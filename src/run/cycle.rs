@@ -9,7 +9,7 @@ use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
-use super::steering::{Command, Range, Steering};
+use super::steering::{Command, Range, Steering, drawn_by};
 use super::steps::{PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
@@ -128,6 +128,10 @@ pub(super) struct Run<'a> {
     pub(super) began: Instant,
     pub(super) report: &'a mut RunReport,
     pub(super) renderer: Renderer,
+    /// `[render]` with the method and the budget that commands set.
+    pub(super) render: RenderSettings,
+    /// The newest budget, also while the method has none.
+    budget: Option<f64>,
     pub(super) transfer: TransferRecord,
     pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
@@ -232,6 +236,8 @@ enum Commands {
     None,
     /// The camera, or whether the window stands still.
     View,
+    /// The method: the picture begins anew.
+    Method,
     /// The ramp or the tolerance too, by which steps are chosen.
     Colours,
 }
@@ -425,8 +431,23 @@ impl<'a> Run<'a> {
             peak: f32::NEG_INFINITY,
         };
         let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
-        let progress = RunProgress::default();
-        Ok(Self { plan, options, threads, stop, began, report, renderer, transfer, color_bar, learning, progress, checkpoints })
+        let (progress, render) = (RunProgress::default(), scene.render.clone());
+        Ok(Self {
+            plan,
+            options,
+            threads,
+            stop,
+            began,
+            report,
+            renderer,
+            budget: render.budget,
+            render,
+            transfer,
+            color_bar,
+            learning,
+            progress,
+            checkpoints,
+        })
     }
 }
 
@@ -581,15 +602,19 @@ impl<B: Backend> Cycle<'_, B> {
     fn frames(&mut self, slides: &dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
-        let target = self.run.plan.scene.render.until;
         let planned = warmups + time.frames_per_slide;
-        let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
         let (mut number, mut since_command) = (0, None);
         loop {
             let commands = self.run.apply_commands();
             if commands > Commands::None {
                 since_command = Some(0);
             }
+            if commands >= Commands::Method {
+                with!(&mut self.session, on => on.picture = Default::default());
+            }
+            // Only smooth methods have a target.
+            let target = self.run.render.until;
+            let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
             if commands == Commands::Colours && self.look_at_steps(slide)? {
                 with!(&mut self.session, on => {
                     on.tracer = None;
@@ -719,8 +744,12 @@ impl Run<'_> {
         let Some(steering) = &self.options.steering else { return Commands::None };
         let mut changed = Commands::None;
         for command in steering.take() {
-            let is_view = command.set.range.is_none() && command.set.tolerance.is_none();
-            changed = changed.max(if is_view { Commands::View } else { Commands::Colours });
+            let set = &command.set;
+            changed = changed.max(match set {
+                _ if set.range.is_some() || set.tolerance.is_some() => Commands::Colours,
+                _ if set.method.is_some_and(|method| method != self.render.method) => Commands::Method,
+                _ => Commands::View,
+            });
             match self.apply(&command) {
                 Ok(()) => self.progress.commands.push(command),
                 Err(refused) => self.progress.warnings.push(format!("command {} had no effect: {refused}", command.number)),
@@ -753,6 +782,16 @@ impl Run<'_> {
             self.report.transfer = Some(self.transfer);
             // Its residuals are those of another ramp.
             self.learning.trust.reset();
+        }
+        if let Some(method) = set.method {
+            // Of another method.
+            self.progress.seconds_per_sample = None;
+            // A budget waits for the method that has one.
+            self.render = drawn_by(&self.plan.scene.render, method, self.budget);
+        }
+        if let Some(budget) = set.budget {
+            self.budget = Some(budget);
+            self.render.budget = self.budget;
         }
         if let Some(tolerance) = set.tolerance {
             self.learning.trust.set_tolerance(tolerance);

@@ -50,13 +50,15 @@ impl Run<'_> {
     ) -> Result<Frame, RunEnd> {
         let preparation_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
-        let gate = match scene.render.method {
+        let method = self.render.method;
+        let gate = match method {
             Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto => self.learning.trust.gate(),
             Method::Reference => Gate::uniform(false),
             Method::Surrogate => Gate::uniform(true),
         };
         // The frame is rendered with frozen weights, which were not trained on its samples.
-        let frozen = on.surrogate.as_ref().map(Surrogate::freeze).transpose()?;
+        let serves = on.surrogate.as_ref().filter(|_| method != Method::Reference);
+        let frozen = serves.map(Surrogate::freeze).transpose()?;
         let renderer = self.renderer.clone();
         let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
         let computed = self.picture(on, frozen.as_ref(), &picture, sink).and_then(|work| {
@@ -87,7 +89,7 @@ impl Run<'_> {
         record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
         record.verified_error = verified;
         record.picture_error = work.rendered.error;
-        if scene.render.method.is_smooth() {
+        if method.is_smooth() {
             self.progress.seconds_per_sample = Some(work.render_seconds / work.samples_per_pixel);
         }
         let samples = work.rendered.samples.commit();
@@ -152,10 +154,12 @@ impl Run<'_> {
         sink: &mut Sink<'_>,
     ) -> Result<Work<B::Samples>, RunEnd> {
         self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
-        let learns = on.surrogate.as_ref().is_some_and(Surrogate::learns);
-        let is_smooth = self.plan.scene.render.method.is_smooth();
+        let method = self.render.method;
+        let (serves, is_smooth) = (method != Method::Reference, method.is_smooth());
+        let learns = serves && on.surrogate.as_ref().is_some_and(Surrogate::learns);
         // A smooth picture measures its own error, so that labels of a table have no use.
-        let (extras, keep) = (self.label_extras(), if is_smooth && !learns { 0 } else { self.labels_per_frame(on) });
+        let needs_labels = serves && (learns || !is_smooth);
+        let (extras, keep) = (self.label_extras(), if needs_labels { self.labels_per_frame(on) } else { 0 });
         let On { backend, tracer, surrogate, picture: accumulated } = on;
         // A picture shows the surrogate as it was when the picture started. It starts anew whenever the training has doubled.
         let steps = self.report.train_steps + self.learning.unreported.steps;
@@ -171,11 +175,11 @@ impl Run<'_> {
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
         let samples_per_pixel = match scene.time.warmup_samples.filter(|_| picture.place.is_warmup) {
             // Its samples only measure the error.
-            _ if scene.render.method == Method::Marched => 2.0 * AUDIT_PAIRS,
+            _ if method == Method::Marched => 2.0 * AUDIT_PAIRS,
             Some(samples) => samples as f64,
-            None => self.progress.affordable_samples(&scene.render),
+            None => self.progress.affordable_samples(&self.render),
         };
-        let smooth = match scene.render.method {
+        let smooth = match method {
             method if method.is_smooth() => {
                 let nodes = self
                     .learning
@@ -280,7 +284,9 @@ impl Run<'_> {
         let settings = &self.plan.scene.training;
         let (Some(_), None) = (slides.is_awaited(), settings.steps_per_frame) else { return Ok(()) };
         let is_awaited = || slides.is_awaited() == Some(true);
-        let Some(surrogate) = on.surrogate.as_mut().filter(|surrogate| surrogate.learns() && !self.learning.buffer.is_empty()) else {
+        let serves = self.render.method != Method::Reference;
+        let Some(surrogate) = on.surrogate.as_mut().filter(|surrogate| serves && surrogate.learns() && !self.learning.buffer.is_empty())
+        else {
             return Ok(());
         };
         let begin = Instant::now();
@@ -343,7 +349,7 @@ impl Run<'_> {
             source: self.plan.source.clone(),
             transfer: self.transfer,
             direction: self.plan.map.direction.name().into(),
-            method: self.plan.scene.render.method.name().into(),
+            method: self.render.method.name().into(),
             device: on.backend.name(),
             size: [film.width, film.height],
             samples_per_pixel: work.samples_per_pixel,

@@ -2,7 +2,7 @@
 
 use super::setup::{Plan, assemble};
 use crate::field::Domain;
-use crate::render::{Camera, CameraSettings, Transfer, TransferSettings};
+use crate::render::{Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, require, shown};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
@@ -22,6 +22,12 @@ pub struct Change {
     /// FTLE (1/time) at which extinction begins and is full.
     #[serde(rename = "transfer", default, skip_serializing_if = "Option::is_none")]
     pub range: Option<Range>,
+    /// Source of the answers to queries.
+    #[serde(rename = "render.method", default, skip_serializing_if = "Option::is_none")]
+    pub method: Option<Method>,
+    /// Milliseconds for the samples of a `two_level` frame.
+    #[serde(rename = "render.budget", default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<f64>,
     /// True: the window stands still.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub paused: Option<bool>,
@@ -47,9 +53,13 @@ impl Change {
         self.camera = self.camera.take().filter(|_| later.camera.is_none());
         self.tolerance = self.tolerance.filter(|_| later.tolerance.is_none());
         self.range = self.range.filter(|_| later.range.is_none());
+        self.method = self.method.filter(|_| later.method.is_none());
+        self.budget = self.budget.filter(|_| later.budget.is_none());
         self.paused = self.paused.filter(|_| later.paused.is_none());
     }
 }
+
+const METHODS: &str = "reference, surrogate, gated, marched or two_level";
 
 /// A command that took effect.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -61,7 +71,7 @@ pub struct Command {
 }
 
 /// State of a run for those who steer it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SteeringState {
     /// Number of accepted commands that changed something.
     pub commands: u64,
@@ -69,6 +79,10 @@ pub struct SteeringState {
     pub paused: bool,
     /// 2 or 3.
     pub dimensions: usize,
+    /// `render.method` of the next frame.
+    pub method: Method,
+    /// `render.budget` of the next frame, in milliseconds. `None` without one, or if the method has none.
+    pub budget: Option<f64>,
 }
 
 /// The commands to a run. Its memory does not grow with them: a later value replaces an earlier one that has not taken effect.
@@ -79,20 +93,31 @@ pub struct Steering {
     aspect: f64,
     trust: TrustSettings,
     transfer: TransferSettings,
+    /// As the run began.
+    render: RenderSettings,
     direction: &'static str,
     dimensions: usize,
     state: Mutex<State>,
     changed: Condvar,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct State {
     commands: u64,
     paused: bool,
+    /// In effect once the pending commands are.
+    method: Method,
+    budget: Option<f64>,
     /// The run makes no further frame.
     ended: bool,
     /// For the next frame.
     pending: Vec<Command>,
+}
+
+impl State {
+    fn new(render: &RenderSettings) -> Self {
+        Self { commands: 0, paused: false, method: render.method, budget: render.budget, ended: false, pending: Vec::new() }
+    }
 }
 
 impl Steering {
@@ -107,7 +132,8 @@ impl Steering {
             transfer: scene.transfer.clone().unwrap_or_default(),
             direction: plan.map.direction.name(),
             dimensions,
-            state: Mutex::default(),
+            state: Mutex::new(State::new(&scene.render)),
+            render: scene.render.clone(),
             changed: Condvar::new(),
         }
     }
@@ -117,24 +143,28 @@ impl Steering {
     /// # Errors
     /// The first key that is unknown or cannot change during a run, or whose value is not accepted.
     pub fn command(&self, set: &Map<String, Value>) -> Result<SteeringState, Refused> {
-        let change = self.check(set)?;
         let mut state = self.lock();
+        let change = self.check(set, state.method)?;
         if state.ended {
             return Err(Refused::new("command", "comes after the last frame", "commands while the run makes frames"));
         }
         if !change.is_empty() {
             state.commands += 1;
             state.paused = change.paused.unwrap_or(state.paused);
+            state.method = change.method.unwrap_or(state.method);
+            state.budget = change.budget.or(state.budget);
             state.pending.iter_mut().for_each(|earlier| earlier.set.remove(&change));
             state.pending.retain(|earlier| !earlier.set.is_empty());
             let number = state.commands;
             state.pending.push(Command { number, set: change });
             self.changed.notify_all();
         }
-        Ok(SteeringState { commands: state.commands, paused: state.paused, dimensions: self.dimensions })
+        let State { commands, paused, method, budget, .. } = *state;
+        Ok(SteeringState { commands, paused, dimensions: self.dimensions, method, budget: budget.filter(|_| method == Method::TwoLevel) })
     }
 
-    fn check(&self, set: &Map<String, Value>) -> Result<Change, Refused> {
+    /// What a command changes. `method` is the one that is in effect without it.
+    fn check(&self, set: &Map<String, Value>, method: Method) -> Result<Change, Refused> {
         let mut change = Change::default();
         for (key, value) in set {
             match key.as_str() {
@@ -155,6 +185,13 @@ impl Steering {
                     Transfer::new(&settings, 1.0).map_err(Refused::from)?;
                     change.range = Some(range);
                 }
+                "render.method" => {
+                    let method = read(key, value, METHODS)?;
+                    require(method != Method::Auto, key, value, METHODS)?;
+                    self.check_method(method)?;
+                    change.method = Some(method);
+                }
+                "render.budget" => change.budget = Some(read(key, value, "milliseconds, 0.1 to 600000")?),
                 "paused" => change.paused = Some(read(key, value, "true or false")?),
                 "time.direction" => {
                     let accepted =
@@ -162,12 +199,31 @@ impl Steering {
                     require(*value == *self.direction, key, value, &accepted)?;
                 }
                 other => {
-                    let accepted = "camera, trust.tolerance, transfer and paused: all else stays as the run began";
+                    let accepted =
+                        "camera, trust.tolerance, transfer, render.method, render.budget and paused: all else stays as the run began";
                     return Err(Refused::new(other, "cannot change during a run", accepted));
                 }
             }
         }
+        if let Some(budget) = change.budget {
+            // Of the method that comes with it, if one does.
+            let method = change.method.unwrap_or(method);
+            let found = format!("is {budget} with render.method = \"{}\"", method.name());
+            if method != Method::TwoLevel {
+                return Err(Refused::new("render.budget", found, "a budget with render.method = \"two_level\""));
+            }
+            RenderSettings { method, budget: Some(budget), ..self.render.clone() }.check().map_err(Refused::from)?;
+        }
         Ok(change)
+    }
+
+    /// Refuses a method that this run cannot take.
+    fn check_method(&self, method: Method) -> Result<(), Refused> {
+        if self.render.method == Method::Reference && method != Method::Reference {
+            let found = format!("is \"{}\", and this run has no surrogate, since it began with \"reference\"", method.name());
+            return Err(Refused::new("render.method", found, "\"reference\"; another run may begin with another method"));
+        }
+        drawn_by(&self.render, method, None).check().map_err(Refused::from)
     }
 
     /// The commands since the last call.
@@ -197,6 +253,12 @@ impl Steering {
     }
 }
 
+/// Settings of the picture with another method: without what only other methods have.
+pub(super) fn drawn_by(render: &RenderSettings, method: Method, budget: Option<f64>) -> RenderSettings {
+    let (budget, until) = (budget.filter(|_| method == Method::TwoLevel), render.until.filter(|_| method.is_smooth()));
+    RenderSettings { method, budget, until, ..render.clone() }
+}
+
 /// Reads a value; a fault names the key inside it.
 fn read<'a, T: Deserialize<'a>>(key: &str, value: &'a Value, accepted: &str) -> Result<T, Refused> {
     serde_path_to_error::deserialize(value).map_err(|error| {
@@ -214,14 +276,19 @@ mod tests {
     use serde_json::json;
 
     fn steering() -> Steering {
+        steering_of(&RenderSettings::default())
+    }
+
+    fn steering_of(render: &RenderSettings) -> Steering {
         Steering {
             home: CameraSettings { eye: [0.0, 0.0, 2.0], look_at: [0.0; 3], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true },
             aspect: 2.0,
             trust: TrustSettings::default(),
             transfer: TransferSettings::default(),
+            render: render.clone(),
             direction: "forward",
             dimensions: 2,
-            state: Mutex::default(),
+            state: Mutex::new(State::new(render)),
             changed: Condvar::new(),
         }
     }
@@ -254,7 +321,15 @@ mod tests {
             (json!({"transfer": {"low": 2}}), "`transfer` cannot be read (missing field `high`)"),
             (json!({"paused": 1}), "`paused` is 1; accepted: true or false"),
             (json!({"time.direction": "backward"}), "`time.direction` is \"backward\"; accepted: \"forward\", as the run began"),
-            (json!({"render.method": "gated"}), "`render.method` cannot change during a run; accepted: camera"),
+            (json!({"render.width": 64}), "`render.width` cannot change during a run; accepted: camera"),
+            (json!({"render.method": "auto"}), "`render.method` is \"auto\"; accepted: reference, surrogate, gated, marched or two_level"),
+            (json!({"render.method": "exact"}), "`render.method` is \"exact\"; accepted: reference, surrogate"),
+            (json!({"render.budget": 0.01}), "`render.budget` is 0.01; accepted: milliseconds, 0.1 to 600000"),
+            (json!({"render.budget": "fast"}), "`render.budget` is \"fast\"; accepted: milliseconds"),
+            (
+                json!({"render.budget": 50, "render.method": "gated"}),
+                "`render.budget` is 50 with render.method = \"gated\"; accepted: a budget",
+            ),
             // One of two keys is wrong.
             (json!({"paused": true, "trust.tolerance": -1}), "`trust.tolerance` is -1.0"),
         ] {
@@ -262,9 +337,33 @@ mod tests {
             assert!(error.starts_with(hint), "{error}\n{hint}");
         }
         assert!(steering.take().is_empty() && !steering.is_paused());
-        let state = SteeringState { commands: 0, paused: false, dimensions: 2 };
+        let state = SteeringState { commands: 0, paused: false, dimensions: 2, method: Method::TwoLevel, budget: None };
         assert_eq!(command(&steering, json!({})), Ok(state));
         assert_eq!(command(&steering, json!({"time.direction": "forward"})), Ok(state));
+    }
+
+    #[test]
+    fn a_method_needs_what_the_run_has() {
+        let traced = steering_of(&RenderSettings { method: Method::Reference, ..RenderSettings::default() });
+        for method in ["surrogate", "gated", "marched", "two_level"] {
+            let error = command(&traced, json!({ "render.method": method })).unwrap_err();
+            let hint = format!("`render.method` is \"{method}\", and this run has no surrogate, since it began with \"reference\"");
+            assert!(error.starts_with(&hint), "{error}");
+        }
+        assert_eq!(command(&traced, json!({"render.method": "reference"})).unwrap().commands, 1);
+        // A share of a sample is something for smooth pictures only; their target is left out.
+        let render = RenderSettings { samples: 0.5, until: Some("40dB".to_owned().try_into().unwrap()), ..RenderSettings::default() };
+        let error = command(&steering_of(&render), json!({"render.method": "gated"})).unwrap_err();
+        assert!(error.contains("`render.samples` is 0.5; accepted: a whole number"), "{error}");
+        let smooth = steering_of(&RenderSettings { samples: 2.0, budget: Some(40.0), ..render });
+        let state = |set| command(&smooth, set).map(|state| (state.method, state.budget));
+        assert_eq!(state(json!({})), Ok((Method::TwoLevel, Some(40.0))));
+        assert_eq!(state(json!({"render.method": "gated"})), Ok((Method::Gated, None)));
+        assert!(state(json!({"render.budget": 20})).unwrap_err().contains("is 20 with render.method = \"gated\""));
+        assert_eq!(state(json!({"render.method": "two_level"})), Ok((Method::TwoLevel, Some(40.0))));
+        assert_eq!(state(json!({"render.method": "two_level", "render.budget": 20.5})), Ok((Method::TwoLevel, Some(20.5))));
+        let taken = serde_json::to_value(smooth.take()).unwrap();
+        assert_eq!(taken, json!([{"number": 3, "set": {"render.method": "two_level", "render.budget": 20.5}}]));
     }
 
     #[test]

@@ -30,6 +30,11 @@ pub enum SteerError {
 }
 
 impl SteerError {
+    /// Whether another program listens at the endpoint.
+    pub fn is_in_use(&self) -> bool {
+        matches!(self, Self::Bind { source: BindError::InUse, .. })
+    }
+
     /// Whether the request is at fault, and not the system.
     pub fn is_usage(&self) -> bool {
         matches!(self, Self::Bind { source: BindError::Endpoint(_), .. })

@@ -3,13 +3,15 @@
 
 #[path = "../kit/mod.rs"]
 mod kit;
+mod metrics;
 mod program;
 mod steering;
+mod values;
 mod visitor;
 
 use kit::publishing;
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
-use ridgewatch::publish::{PublishSettings, Publisher};
+use ridgewatch::publish::{NewestFrame, PublishSettings, Publisher};
 use ridgewatch::render::Film;
 use ridgewatch::run::{ColorBar, Frame, FrameRecord};
 use ridgewatch_zmtp::{Keep, Limits, PubSocket};
@@ -44,15 +46,15 @@ struct Stage {
 
 impl Stage {
     fn new() -> Self {
-        Self::with(tempfile::tempdir().unwrap(), None)
+        Self::with(tempfile::tempdir().unwrap(), None, None)
     }
 
-    /// With the connection file of a command socket.
-    fn with(folder: TempDir, steer: Option<PathBuf>) -> Self {
+    /// With the connection file of a command socket, or the newest frame of a run.
+    fn with(folder: TempDir, steer: Option<PathBuf>, newest: Option<Arc<NewestFrame>>) -> Self {
         let token = Token::random().unwrap();
         let secret = token.secret().to_owned();
         let endpoint = format!("ipc://{}", folder.path().join("frames").display());
-        let settings = DashboardSettings { steer, ..DashboardSettings::local(endpoint, Some(0), token) };
+        let settings = DashboardSettings { steer, newest, ..DashboardSettings::local(endpoint, Some(0), token) };
         Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
     }
 

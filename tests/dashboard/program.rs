@@ -4,6 +4,7 @@ use crate::kit::program::{Outcome, Running, ridgewatch, run, set, start, text, u
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, get, socket_status};
 use std::net::SocketAddr;
+use std::os::unix::fs::DirBuilderExt;
 use std::process::Command;
 use std::time::Duration;
 
@@ -126,4 +127,50 @@ fn a_run_with_a_command_socket_is_steered_from_its_page() {
     running.signal(libc::SIGTERM);
     let outcome = running.wait();
     assert!(!outcome.stderr.contains(&token) && !outcome.stderr.contains(&watching), "{}", outcome.stderr);
+}
+
+#[test]
+fn a_second_run_with_a_page_is_steered_at_an_endpoint_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let private = folder.path().join("private");
+    std::fs::DirBuilder::new().mode(0o700).create(&private).unwrap();
+    let scene =
+        scene::write(folder.path(), &double_gyre([32, 16, 1], "time.tau = 10\ntime.slides = 100000\nrender.method = \"reference\"\n"));
+    let replay = |out: &str, options: &[&str]| {
+        let mut command = ridgewatch(["replay", &scene, "--json", "--out", text(&folder.path().join(out))]);
+        command
+            .args(options)
+            .args(set(&["flow.steps=20", "publish.preview=false", "publish.exr=\"none\""]))
+            .env("XDG_RUNTIME_DIR", &private);
+        command
+    };
+    let first = start(&mut replay("first", &["--dashboard=0", "--steer"]));
+    let (address, token) = parts(&url(&first));
+    let mut of_first = Visitor::open(address, &token);
+    of_first.until_state(|state| state["steering"]["ready"]["commands"] == 0);
+    let second = start(&mut replay("second", &["--dashboard=0", "--steer"]));
+    let (address, token) = parts(&url(&second));
+    let mut visitor = Visitor::open(address, &token);
+    visitor.until_state(|state| state["steering"]["ready"]["commands"] == 0);
+    visitor.say(r#"{"command": 1, "set": {"trust.tolerance": 0.125}}"#);
+    assert_eq!(visitor.next("answer").json["accepted"]["commands"], 1);
+    while visitor.frame().json["header"]["record"]["tolerance"] != 0.125 {}
+    of_first.until_state(|state| state["steering"]["ready"]["commands"] == 0);
+    // A named endpoint that is taken is refused, and so is one that no page would find.
+    for options in [&["--dashboard=0", "--steer=private"][..], &["--steer"], &["--steer", "--publish=tcp://127.0.0.1:0"]] {
+        run(&mut replay("third", options)).refused(1, &["command socket `private`: another program listens there"]);
+        assert!(!folder.path().join("third").exists(), "{options:?}");
+    }
+    for running in [first, second] {
+        running.signal(libc::SIGTERM);
+        running.wait();
+    }
+    let left: Vec<_> = walk(&private).into_iter().filter(|name| name.ends_with(".connection")).collect();
+    assert!(left.is_empty(), "{left:?}");
+}
+
+/// Names of the files below a folder.
+fn walk(folder: &std::path::Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path.display().to_string()] }).collect()
 }

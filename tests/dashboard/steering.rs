@@ -20,7 +20,7 @@ fn command_socket(folder: &Path) -> CommandSocket {
 fn stage() -> Stage {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("commands.connection");
-    Stage::with(folder, Some(file))
+    Stage::with(folder, Some(file), None)
 }
 
 fn answer(visitor: &mut Visitor, number: u64, set: Value) -> Value {
@@ -46,9 +46,11 @@ fn commands_are_passed_on_and_their_answers_back() {
     assert!(state["steering"]["none"].as_str().unwrap().contains("is not reached;"), "{state}");
     assert!(!state["steering"].to_string().contains("connection"), "{state}");
     let socket = command_socket(stage.folder.path());
-    visitor.until_state(|state| state["steering"]["ready"] == json!({"commands": 0, "paused": false, "dimensions": 2}));
+    let state = |commands, paused| json!({"commands": commands, "paused": paused, "dimensions": 2, "method": "gated", "budget": null});
+    let begun = visitor.until_state(|state| !state["steering"]["ready"].is_null());
+    assert_eq!(begun["steering"]["ready"], state(0, false));
     let paused = answer(&mut visitor, 2, json!({"paused": true}));
-    assert_eq!(paused["accepted"], json!({"commands": 1, "paused": true, "dimensions": 2}));
+    assert_eq!(paused["accepted"], state(1, true));
     visitor.until_state(|state| state["steering"]["ready"]["paused"] == true);
     assert_eq!(refused(&mut visitor, json!({"trust.tolerance": -1})), "`trust.tolerance` is -1.0; accepted: a number above 0");
     assert!(refused(&mut visitor, json!({"render.width": 7})).contains("`render.width` cannot change during a run"));

@@ -5,6 +5,8 @@ use crate::kit::scene::{double_gyre, setup, write};
 use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
+use std::collections::HashSet;
+use std::os::unix::fs::MetadataExt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -202,4 +204,114 @@ async fn the_program_is_steered_by_its_connection_file_alone() {
     assert!(!file.exists(), "the key goes with the run");
     let mut replay = ridgewatch(["replay", &scene, "--steer=udp://127.0.0.1:1", "--out", text(&folder.path().join("no"))]);
     crate::kit::program::run(&mut replay).refused(2, &["udp://127.0.0.1:1", "neither tcp:// nor ipc://"]);
+}
+
+/// Each picture is that of its method: a smooth one states its error, the reference traces all, and the reference trains nothing.
+#[test]
+fn a_method_is_in_effect_on_the_next_frame() {
+    let network = "surrogate.kind = \"network\"\nnetwork.levels = 2\nnetwork.log2_table = 8\nnetwork.width = 16\nnetwork.batch = 64\n";
+    let keys = format!(
+        "time.tau = 10\nflow.steps = 20\ntime.frames_per_slide = 15\ntraining.steps_per_frame = 2\nrender.method = \"two_level\"\n{network}"
+    );
+    let methods = ["reference", "gated", "marched", "two_level"];
+    let (frames, report) = steered(setup(&double_gyre([32, 16, 2], &keys), &[]), |steering, frame| {
+        let number = frame.record.frame as usize;
+        if number % 3 == 2 && number < 12 {
+            command(steering, json!({"render.method": methods[number / 3]}));
+        }
+        false
+    });
+    assert!(frames.len() == 15 && report.warnings.is_empty(), "{:?}", report.warnings);
+    for (number, Frame { record, film, .. }) in frames.iter().enumerate() {
+        let method = number.checked_sub(3).map_or("two_level", |since| methods[since / 3]);
+        assert_eq!((record.method.as_str(), record.commands.len()), (method, usize::from(number > 0 && number % 3 == 0)), "frame {number}");
+        let is_smooth = ["marched", "two_level"].contains(&method);
+        // A picture that has just begun may know too little of its error to state one of all of it.
+        assert!((record.picture_error.is_none() || is_smooth) && film.error.is_empty() != is_smooth, "frame {number}");
+        let is_reference = method == "reference";
+        assert_eq!((record.surrogate.is_none(), record.surrogate_psnr.is_none()), (is_reference, is_reference), "frame {number}");
+        assert!(!is_reference || record.traced_share == 1.0 && record.traced > 0, "frame {number}");
+        // What was trained before its first frame may be told with it.
+        assert!(!is_reference || number % 3 == 0 || record.training.is_none(), "frame {number}: nothing is trained");
+        assert!(
+            is_reference || number == 0 || record.training.as_ref().is_some_and(|training| training.steps > 0) || number % 3 == 0,
+            "frame {number}"
+        );
+    }
+}
+
+#[test]
+fn a_budget_gives_the_next_frame_its_samples() {
+    let keys = "time.frames_per_slide = 7\nrender.method = \"two_level\"\n";
+    let (frames, _) = steered(scene(keys), |steering, frame| {
+        match frame.record.frame {
+            1 => command(steering, json!({"render.budget": 0.2})),
+            // It waits for its method.
+            3 => command(steering, json!({"render.method": "gated"})),
+            4 => command(steering, json!({"render.method": "two_level", "render.budget": 40})),
+            _ => {}
+        }
+        false
+    });
+    let samples: Vec<f64> = frames.iter().map(|frame| frame.record.samples_per_pixel).collect();
+    let cost = |number: usize| {
+        let seconds = frames[number].record.seconds;
+        (seconds.render + seconds.trace + seconds.predict) / samples[number]
+    };
+    assert_eq!((samples[1], samples[4]), (4.0, 4.0), "{samples:?}");
+    // Its cost with another method says nothing about the first one with a budget.
+    assert_eq!(samples[5], 0.25);
+    // And nothing of the pictures before is left in its own.
+    let held = |number: usize| frames[number].film.samples.iter().sum::<f32>() / frames[number].film.samples.len() as f32;
+    assert!(held(1) > 6.0 && held(3) >= held(1) && held(5) < 1.0, "{} {} {}", held(1), held(3), held(5));
+    for (number, milliseconds) in [(2, 0.2), (3, 0.2), (6, 40.0)] {
+        let expected = (1e-3 * milliseconds / cost(number - 1)).clamp(1.0 / 16.0, 4096.0);
+        assert!((samples[number] / expected - 1.0).abs() < 1e-9, "frame {number}: {samples:?}, not {expected}");
+    }
+}
+
+/// Those that end in the pause are heard, so that others follow: at first only the one on its way ended.
+#[test]
+fn checkpoints_go_on_in_a_pause() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("weights");
+    let network = "surrogate.kind = \"network\"\nnetwork.levels = 2\nnetwork.log2_table = 8\nnetwork.width = 16\nnetwork.batch = 64\n";
+    let keys =
+        format!("time.tau = 10\nflow.steps = 20\ntime.slides = 5\ntraining.steps_per_frame = 1\nrender.method = \"gated\"\n{network}");
+    let setup = setup(&double_gyre([24, 12, 1], &keys), &[]);
+    let steering = Arc::new(Steering::new(&setup.plan));
+    let options = RunOptions {
+        steering: Some(Arc::clone(&steering)),
+        checkpoint: Some(path.clone()),
+        checkpoint_seconds: Some(0.05),
+        threads: 2,
+        ..RunOptions::default()
+    };
+    let (stop, mut last) = (AtomicBool::new(false), 0);
+    let report = std::thread::scope(|scope| {
+        let mut sink = |event: Event| {
+            let Event::Frame(frame) = event else { return };
+            last = frame.record.frame;
+            match last {
+                0 => command(&steering, json!({"paused": true})),
+                // The last frame of the pause. Each checkpoint is another file.
+                32 => {
+                    let (path, stop) = (&path, &stop);
+                    scope.spawn(move || {
+                        let (mut files, end) = (HashSet::new(), Instant::now() + Duration::from_secs(60));
+                        while files.len() < 4 && Instant::now() < end {
+                            files.extend(path.metadata().map(|about| (about.ino(), about.mtime_nsec())));
+                            std::thread::sleep(Duration::from_millis(5));
+                        }
+                        stop.store(true, Ordering::Relaxed);
+                        assert!(files.len() >= 4, "{files:?}");
+                    });
+                }
+                _ => {}
+            }
+        };
+        run(setup, &options, &mut sink, &stop).unwrap()
+    });
+    let totals = report.checkpoints.unwrap();
+    assert!(last == 32 && totals.failed == 0 && totals.written >= 4, "{totals:?}");
 }

@@ -3,10 +3,11 @@ import { Charts, rowOf } from "./charts.js";
 import { ColourBar } from "./colour_bar.js";
 import { Connection } from "./connection.js";
 import { Records } from "./history.js";
-import { Picture } from "./picture.js";
+import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
+import { Values, asker, download, pixelAt } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -19,6 +20,7 @@ const setText = (node, text) => { if (node.textContent !== text) node.textConten
 
 const records = new Records();
 const warnings = new Warnings();
+const token = takeToken();
 const colourBar = new ColourBar(element("colour-bar"));
 const picture = new Picture(element("frame"), pictureChanged);
 const charts = new Charts(element("charts"), (frame) => picture.lookBack(picture.kept.nearest(frame)));
@@ -28,6 +30,11 @@ const steering = new Steering({
   told: (text, frame, urgent) => (urgent ? warnings.hold("command", text, frame) : warnings.log.add(text, frame)),
   // A command is followed live.
   acted: () => { if (picture.held) picture.follow(); },
+});
+
+const values = new Values({
+  ask: asker(token),
+  show: (text, hint = "") => { setText(element("values"), text); element("values").title = hint; },
 });
 
 let connection;
@@ -91,6 +98,7 @@ async function receiveFrame({ sequence, header, payload }, reply) {
 function receiveState(state) {
   server = state;
   steering.receiveState(state);
+  values.receiveState(state);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 
@@ -136,7 +144,12 @@ function pictureChanged(shown) {
   if (record) showFacts(facts(record, shown.header));
   showPosition();
   charts.mark(picture.held ? shown.frame : null);
+  values.frame = heldFrame();
+  values.changed();
 }
+
+/** Number of the frame that is looked back at; null while the newest is followed. */
+const heldFrame = () => (picture.held ? picture.shown.frame : null);
 
 function showFacts(values) {
   for (const node of document.querySelectorAll("[data-fact]")) setText(node, values[node.dataset.fact]);
@@ -154,6 +167,7 @@ function showPosition() {
   setText(element("live"), picture.held ? "Back to live" : "Live");
   element("earlier").disabled = index <= 0;
   element("later").disabled = index >= last;
+  for (const button of document.querySelectorAll("[data-save]")) button.disabled = picture.shown === null;
 }
 
 function conditionItem({ id, level, text, tick }) {
@@ -223,12 +237,20 @@ function showSteering() {
   setText(element("obstacle"), obstacle ?? "");
   setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
   element("pause").setAttribute("aria-pressed", String(steering.paused));
-  const values = { tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  const { method, budget } = steering.ready ?? {};
+  if (document.activeElement !== element("method")) element("method").value = method ?? "";
+  element("budget").disabled = method !== "two_level";
+  const values = { budget, tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
   }
   setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
+}
+
+async function save(ending) {
+  const told = await download(ending, { token, kept: values.kept, shown: picture.shown, held: picture.held });
+  if (told !== null) warnings.hold("download", told, picture.shown.frame);
 }
 
 async function share() {
@@ -279,7 +301,7 @@ const KEYS = {
 
 function pressKey(event) {
   const { key, target } = event;
-  const types = target.matches("input[type=number]");
+  const types = target.matches("input[type=number], select");
   const used = types || event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
   if (used || KEYS[key] === undefined) return;
   event.preventDefault();
@@ -295,11 +317,23 @@ element("theme").addEventListener("click", switchTheme);
 element("open-help").addEventListener("click", () => element("help").showModal());
 document.addEventListener("keydown", pressKey);
 steerBy(element("frame"), steering);
+const point = (event) => values.point(pixelAt(event, pictureBox(element("frame")), [element("frame").width, element("frame").height]), heldFrame());
+for (const type of ["pointermove", "pointerdown"]) element("frame").addEventListener(type, (event) => picture.shown && point(event));
+// A finger that is lifted leaves the value of its pixel.
+element("frame").addEventListener("pointerleave", (event) => event.pointerType === "touch" || values.point(null, null));
+for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", () => save(button.dataset.save));
 element("pause").addEventListener("click", () => steering.togglePause());
 element("home").addEventListener("click", () => steering.home());
 element("share").addEventListener("click", share);
-element("tolerance").addEventListener("change", ({ target }) => {
-  if (Number.isFinite(target.valueAsNumber)) steering.command({ "trust.tolerance": target.valueAsNumber });
+for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.budget"]]) {
+  element(id).addEventListener("change", ({ target }) => {
+    if (Number.isFinite(target.valueAsNumber)) steering.command({ [key]: target.valueAsNumber });
+  });
+}
+element("method").addEventListener("change", ({ target }) => {
+  steering.command({ "render.method": target.value });
+  // Its keys are shortcuts again, and a method that is refused is not shown.
+  target.blur();
 });
 for (const id of ["low", "high"]) {
   element(id).addEventListener("change", () => {
@@ -310,7 +344,7 @@ for (const id of ["low", "high"]) {
 
 explainTerms(element("tip"), element("terms"));
 showPosition();
-connection = new Connection(takeToken(), {
+connection = new Connection(token, {
   message: (message, reply) => RECEIVERS[message.kind]?.(message, reply),
   opened: () => { server = null; steering.abandon(); },
   broken: (error) => warnings.hold("message", `A message of the server was skipped: ${error.message}`),

@@ -5,6 +5,14 @@ import { mediaType } from "./protocol.js";
 // From here on a picture looks better with visible pixels than smeared.
 const ENLARGED = 2;
 
+/** Rectangle of the picture in the window, which may be smaller than the element around it. */
+export function pictureBox(canvas) {
+  const box = canvas.getBoundingClientRect();
+  const fit = Math.min(box.width / canvas.width, box.height / canvas.height);
+  const [width, height] = [canvas.width * fit, canvas.height * fit];
+  return { width, height, left: box.left + (box.width - width) / 2, top: box.top + (box.height - height) / 2 };
+}
+
 export class Picture {
   /** `changed(picture)` is called with the picture that is now shown; null if there is none. */
   constructor(canvas, changed) {

@@ -1,5 +1,6 @@
 // Commands to the run: one on its way at a time, of those that wait the newest value of each key.
 import { orbit, pan, zoom } from "./camera.js";
+import { pictureBox } from "./picture.js";
 
 // Between two commands, so that a drag does not crowd out those of others.
 const SPACING = 60;
@@ -163,13 +164,7 @@ export const steeringKeys = (steering) => ({
 
 /** Lets the pointer steer on the picture. */
 export function steerBy(canvas, steering) {
-  // The picture may be smaller than the element around it.
-  const shown = () => {
-    const box = canvas.getBoundingClientRect();
-    const fit = Math.min(box.width / canvas.width, box.height / canvas.height);
-    const [width, height] = [canvas.width * fit, canvas.height * fit];
-    return { width, height, left: box.left + (box.width - width) / 2, top: box.top + (box.height - height) / 2 };
-  };
+  const shown = () => pictureBox(canvas);
   let last = null;
   canvas.addEventListener("pointerdown", (event) => {
     if (!steering.can || event.button > 2) return;

@@ -8,6 +8,7 @@ const TERMS = {
   slide: "Slide: the window moves on by one step; frames of one slide refine the same picture.",
   traced: "Traced: share of the picture's queries answered by integrating particle paths. The surrogate answered the rest, which is faster but approximate.",
   tolerance: "Tolerance: largest error of the surrogate that is trusted, as a root mean square of the optical residual, in which 1 is the whole colour scale.",
+  budget: "Budget: milliseconds for the samples of a frame; fewer make it faster and noisier. Only the method two_level has one.",
   psnr: "PSNR: how close the picture is to the exact one, over its lit pixels, in decibels. 40 dB is an error of 1 % of full brightness (root mean square), 20 dB 10 %.",
   trusted: "Trusted: part of the domain in which the surrogate's measured error is within the tolerance.",
   surrogate: "Surrogate: a table or neural network that predicts what tracing would give.",

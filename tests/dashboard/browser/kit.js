@@ -59,9 +59,21 @@ export async function stop(child, signal = "SIGTERM") {
 export function startPublisher(endpoint, folder, { scene = "configs/double_gyre.toml", changes = {}, more = [] } = {}) {
   const settings = Object.entries({ ...SMALL, ...changes }).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
   const child = start(["replay", scene, "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings, ...more]);
-  child.stdout.resume();
+  child.text = "";
+  child.stdout.on("data", (part) => { child.text = (child.text + part).slice(-4000); });
   child.once("exit", (code) => { if (code) console.error(`the publisher ended: ${child.log}`); });
   return child;
+}
+
+const printedUrl = (child) => until("an address is printed", () => {
+  if (child.exitCode !== null) throw new Error(`it did not start: ${child.log}`);
+  return /"url":\s*"([^"]+)"/.exec(child.text)?.[1];
+});
+
+/** A run that shows itself, and the address of its page. */
+export async function startShown(folder, { more = [], ...options } = {}) {
+  const child = startPublisher(`ipc://${folder}/frames`, folder, { ...options, more: ["--dashboard=0", "--json", ...more] });
+  return { child, url: await printedUrl(child) };
 }
 
 /** The server, and the port of its page. */
@@ -69,13 +81,9 @@ export async function startDashboard(endpoint, folder, port = 0, token = TOKEN, 
   const file = path.join(folder, "token");
   writeFileSync(file, `${token}\n`, { mode: 0o600 });
   const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json", ...more]);
-  let text = "";
-  child.stdout.on("data", (part) => { text += part; });
-  const url = await until("the dashboard prints its address", () => {
-    if (child.exitCode !== null) throw new Error(`the dashboard did not start: ${child.log}`);
-    return /"url":\s*"([^"]+)"/.exec(text)?.[1];
-  });
-  return { child, port: Number(new URL(url).port) };
+  child.text = "";
+  child.stdout.on("data", (part) => { child.text += part; });
+  return { child, port: Number(new URL(await printedUrl(child)).port) };
 }
 
 /**

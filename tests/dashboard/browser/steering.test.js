@@ -168,6 +168,30 @@ test("a range of colours is in a later record, and on the colour bar", async () 
   });
 });
 
+test("method and budget are in effect with a later record, and a budget needs its method", async () => {
+  await steered("map", async (page, where) => {
+    const { frame, method } = newest(where);
+    assert.equal(method, "two_level");
+    await until("the method is shown", async () => (await page.inputValue("#method")) === "two_level");
+    await until("the budget is shown", async () => (await page.inputValue("#budget")) === "50");
+    await page.selectOption("#method", "gated");
+    const gated = await commanded(where, frame, ["render.method"]);
+    assert.deepEqual([gated.method, gated.picture_error], ["gated", null]);
+    await until("there is no budget", () => page.isDisabled("#budget"));
+    assert.equal(await page.inputValue("#budget"), "");
+    await page.selectOption("#method", "two_level");
+    const back = await commanded(where, gated.frame, ["render.method"]);
+    assert.ok(back.method === "two_level" && back.picture_error !== null);
+    await until("there is a budget", async () => (await page.isEnabled("#budget")) && (await page.inputValue("#budget")) === "50");
+    await page.fill("#budget", "20");
+    await page.press("#budget", "Enter");
+    assert.deepEqual((await commanded(where, back.frame, ["render.budget"])).commands.at(-1).set, { "render.budget": 20 });
+    await page.fill("#budget", "0.01");
+    await page.press("#budget", "Enter");
+    await until("it is refused", async () => /Refused: `render.budget` is 0.01; accepted: milliseconds, 0.1 to 600000/.test(await page.textContent("#warnings")));
+  });
+});
+
 test("a pause holds the window, is said, and the view still moves", async () => {
   await steered("map", async (page, where) => {
     const { frame } = newest(where);

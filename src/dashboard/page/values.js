@@ -1,0 +1,144 @@
+// What the run knows of the pixel under the pointer, and its newest frame as a file.
+import { count, number, withUnit } from "./words.js";
+
+// Between two questions, so that a pointer on its way asks little.
+const SPACING = 50;
+const LIMIT = 5_000;
+const DOWNLOAD_LIMIT = 600_000;
+
+/** The pixel of a picture at a place of the window; null outside. `box` is the rectangle in which the picture is drawn. */
+export function pixelAt({ clientX, clientY }, box, [width, height]) {
+  const [x, y] = [Math.floor(((clientX - box.left) / box.width) * width), Math.floor(((clientY - box.top) / box.height) * height)];
+  return x >= 0 && y >= 0 && x < width && y < height ? [x, y] : null;
+}
+
+/** A channel, in which a thousandth of the light is not seen. */
+const level = (value) => (Number.isFinite(value) && Math.abs(value) < 10 ? value.toFixed(3) : number(value));
+
+/** One line about a pixel. */
+export function valueWords({ frame, x, y, channels, unit, no_error: noError }) {
+  const { R, G, B, A, error, "ftle.mean": ftle, "missing.share": missing } = channels;
+  const where = `frame ${count(frame)} at ${x}, ${y}:`;
+  if (missing === 1) return `${where} no data (land, or outside of the grid)`;
+  // Alpha is the share of rays that met a structure; without one there is no FTLE.
+  const value = Number.isFinite(ftle) ? `FTLE ${withUnit(ftle, unit)}` : "no FTLE shown";
+  const colour = `colour ${[R, G, B].map(level).join(" ")}`;
+  const stated = noError ? "± unknown" : `± ${number(error, 2)}`;
+  return `${where} ${value}, ${colour} ${stated}, alpha ${level(A)}`;
+}
+
+/** Asks the server for a pixel at a time; of those that wait the newest counts. */
+export class Values {
+  /** `ask(query)` returns a promise of `{ values }` or `{ problem }`; `show(text, hint)` is called with what is known. */
+  constructor({ ask, show }) {
+    Object.assign(this, { ask, show });
+    this.kept = null;
+    this.pixel = null;
+    this.frame = null;
+    this.busy = false;
+    this.due = false;
+  }
+
+  receiveState({ values }) {
+    this.kept = values ?? null;
+    if (this.pixel === null) this.idle();
+  }
+
+  /** Why no value can be told; null if it can. */
+  get obstacle() {
+    if (this.kept === null) return "";
+    return this.kept.ready === undefined ? `No values here: ${this.kept.none}.` : null;
+  }
+
+  idle() { this.show(this.obstacle ?? "Point at the picture for the value and error of a pixel."); }
+
+  /** The pointer is at this pixel (null: nowhere). `frame` is the number of the picture that is looked back at; null: the newest. */
+  point(pixel, frame) {
+    this.pixel = pixel;
+    this.frame = frame;
+    this.changed();
+  }
+
+  /** Another picture may be there. */
+  changed() {
+    if (this.pixel === null || this.obstacle !== null) return this.idle();
+    this.due = true;
+    return this.next();
+  }
+
+  async next() {
+    if (this.busy || !this.due) return;
+    [this.busy, this.due] = [true, false];
+    const [x, y] = this.pixel;
+    const answer = await this.ask({ x, y, ...(this.frame === null ? {} : { frame: this.frame }) });
+    // The pointer may have left meanwhile.
+    if (this.pixel !== null) {
+      if (answer.values) this.show(valueWords(answer.values), answer.values.no_error);
+      else this.show(`No value: ${answer.problem}`);
+    }
+    setTimeout(() => { this.busy = false; if (this.pixel !== null) this.next(); }, SPACING);
+  }
+}
+
+function address(path, token, query) {
+  const url = new URL(path, new URL("./", location.href));
+  for (const [name, value] of Object.entries({ token, ...query })) if (value !== null) url.searchParams.set(name, value);
+  return url;
+}
+
+/** Fetches from this server. Throws an error with the server's words. */
+async function get(url, limit) {
+  let answer;
+  try {
+    answer = await fetch(url, { signal: AbortSignal.timeout(limit) });
+  } catch (error) {
+    throw new Error(error.name === "TimeoutError" ? "the server did not answer in time" : "the server is not reached", { cause: error });
+  }
+  if (!answer.ok) throw new Error((await answer.text()).trim() || `the server answers ${answer.status}`);
+  return answer;
+}
+
+/** A function for `ask`. */
+export const asker = (token) => async (query) => {
+  try {
+    return { values: await (await get(address("values", token, query), LIMIT)).json() };
+  } catch (error) {
+    return { problem: error.message };
+  }
+};
+
+/** Name of a file of a frame, as the server gives. */
+export function fileName(run, { frame, slide }, ending) {
+  return `${run}-frame-${String(frame).padStart(6, "0")}-slide-${String(slide).padStart(4, "0")}.${ending}`;
+}
+
+function save(blob, name) {
+  const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  // The browser has begun to read it by then.
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}
+
+/** Saves a frame as `exr`, `png` or `json`: as the server has it, or else what this page has (not of `exr`). Returns what is to be told; null if nothing. */
+export async function download(ending, { token, kept, shown, held }) {
+  const { header, blob } = shown;
+  const run = kept?.ready ?? "run";
+  let problem = kept?.none ?? "the server has not said what it keeps";
+  if (kept?.ready !== undefined) {
+    try {
+      const answer = await get(address(`frame.${ending}`, token, { frame: held ? shown.frame : null }), DOWNLOAD_LIMIT);
+      const named = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "");
+      save(await answer.blob(), named?.[1] ?? fileName(run, header.record, ending));
+      return null;
+    } catch (error) {
+      problem = error.message;
+    }
+  }
+  if (ending === "exr") return `No EXR: ${problem}`;
+  if (ending === "json") {
+    save(new Blob([JSON.stringify(header.record, null, 2)], { type: "application/json" }), fileName(run, header.record, ending));
+    return null;
+  }
+  save(blob, fileName(run, header.record, header.encoding === "jpeg" ? "jpg" : header.encoding));
+  return header.encoding === "png" ? null : `The picture was saved as this page shows it (${header.encoding}): ${problem}`;
+}

@@ -1,0 +1,185 @@
+//! Pixels of the newest frame of the run in this process, and that frame as a file.
+
+use super::access::parameter;
+use crate::publish::{NewestFrame, NoFrame, channels_at, encode_exr, png};
+use crate::run::Frame;
+use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
+use axum::http::{StatusCode, Uri};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use serde::Serialize;
+use serde_json::{Map, Value};
+use std::sync::Arc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+/// Maximum number of pixels of a picture that is encoded here: an EXR of some 700 MB before compression.
+const MAX_PIXELS: usize = 1 << 24;
+/// Files that are encoded or on their way at once. Each may be large.
+const MAX_DOWNLOADS: usize = 1;
+
+const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
+
+/// What is served of the pixels, as a page is told.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Kept<'a> {
+    /// The newest frame, of the run of this name.
+    Ready(&'a str),
+    /// Why nothing is.
+    None(&'static str),
+}
+
+/// Serves the newest frame, if it is in this process.
+#[derive(Debug)]
+pub(super) struct Pixels {
+    newest: Option<Arc<NewestFrame>>,
+    downloads: Arc<Semaphore>,
+}
+
+/// A file that a frame is sent as.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum File {
+    Exr,
+    Png,
+    Record,
+}
+
+/// A request that is not met: status and words.
+type Refusal = (StatusCode, String);
+
+impl File {
+    /// The file that a path asks for.
+    pub fn named(path: &str) -> Option<Self> {
+        let files = [("/frame.exr", Self::Exr), ("/frame.png", Self::Png), ("/frame.json", Self::Record)];
+        files.into_iter().find(|(end, _)| path.ends_with(end)).map(|(_, file)| file)
+    }
+
+    /// Ending of its name, and its media type.
+    fn form(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Exr => ("exr", "image/x-exr"),
+            Self::Png => ("png", "image/png"),
+            Self::Record => ("json", "application/json"),
+        }
+    }
+
+    fn encode(self, frame: &Frame) -> Result<Vec<u8>, String> {
+        match self {
+            Self::Exr => encode_exr(&frame.film, Some(&frame.record)),
+            Self::Png => png(&frame.film, frame.tone_map).map_err(|error| error.to_string()),
+            Self::Record => serde_json::to_vec_pretty(&*frame.record).map_err(|error| error.to_string()),
+        }
+    }
+}
+
+impl Pixels {
+    pub fn new(newest: Option<Arc<NewestFrame>>) -> Self {
+        Self { newest, downloads: Arc::new(Semaphore::new(MAX_DOWNLOADS)) }
+    }
+
+    pub fn kept(&self) -> Kept<'_> {
+        self.newest.as_ref().map_or(Kept::None(ELSEWHERE), |newest| Kept::Ready(newest.run()))
+    }
+
+    /// The frame that a query asks for by its number, or the newest one, and the name of its run.
+    fn frame(&self, uri: &Uri) -> Result<(Frame, &str), Refusal> {
+        let newest = self.newest.as_ref().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
+        let wanted =
+            parameter(uri, "frame").map(|text| whole("frame", text, "the number of a frame, or none for the newest")).transpose()?;
+        match newest.get(wanted) {
+            Ok(frame) => Ok((frame, newest.run())),
+            Err(NoFrame::NotYet) => Err((StatusCode::NOT_FOUND, "no frame is complete yet".to_owned())),
+            Err(NoFrame::MovedOn { wanted, kept }) => {
+                Err((StatusCode::GONE, format!("frame {wanted} is no longer kept: the run keeps its newest one, {kept} by now")))
+            }
+        }
+    }
+
+    /// Answers with all that is known of a pixel: the channels of the frame's EXR there, as JSON.
+    pub fn values(&self, uri: &Uri) -> Response {
+        self.values_at(uri).map_or_else(refused, |json| ([(CONTENT_TYPE, "application/json")], json).into_response())
+    }
+
+    fn values_at(&self, uri: &Uri) -> Result<String, Refusal> {
+        #[derive(Serialize)]
+        struct Values<'a> {
+            frame: u64,
+            slide: u64,
+            x: usize,
+            y: usize,
+            size: [usize; 2],
+            /// By the names of the EXR; `null` where there is no value.
+            channels: Map<String, Value>,
+            /// Of `ftle.mean`.
+            unit: &'a str,
+            /// Why there is no error.
+            #[serde(skip_serializing_if = "Option::is_none")]
+            no_error: Option<String>,
+        }
+        let (Frame { film, record, color_bar, .. }, _) = self.frame(uri)?;
+        let at = |name: &str, end: usize| {
+            let accepted = format!("a pixel of the picture, 0 to {}", end.saturating_sub(1));
+            let text = parameter(uri, name).unwrap_or_default();
+            let value = whole(name, text, &accepted)?;
+            usize::try_from(value).ok().filter(|value| *value < end).ok_or_else(|| bad(name, text, &accepted))
+        };
+        let (x, y) = (at("x", film.width)?, at("y", film.height)?);
+        let channels: Map<String, Value> =
+            channels_at(&film, [x, y]).into_iter().map(|(name, value)| (name.to_owned(), value.into())).collect();
+        let no_error =
+            (!channels.contains_key("error")).then(|| format!("{} states no error of a pixel; marched and two_level do", record.method));
+        let unit = color_bar.as_ref().map_or("", |bar| bar.unit.as_str());
+        let values = Values { frame: record.frame, slide: record.slide, x, y, size: record.size, channels, unit, no_error };
+        serde_json::to_string(&values).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
+    }
+
+    /// Answers with the frame as a file. It is encoded by another thread.
+    pub async fn download(&self, file: File, uri: &Uri) -> Response {
+        self.encoded(file, uri).await.unwrap_or_else(refused)
+    }
+
+    async fn encoded(&self, file: File, uri: &Uri) -> Result<Response, Refusal> {
+        /// Bytes of a file, and the right to send it until all are sent.
+        struct Sent {
+            bytes: Vec<u8>,
+            _permit: OwnedSemaphorePermit,
+        }
+        impl AsRef<[u8]> for Sent {
+            fn as_ref(&self) -> &[u8] {
+                &self.bytes
+            }
+        }
+        let busy = |_| (StatusCode::SERVICE_UNAVAILABLE, "another file is on its way: try again when it has arrived".to_owned());
+        let permit = Arc::clone(&self.downloads).try_acquire_owned().map_err(busy)?;
+        let (frame, run) = self.frame(uri)?;
+        let pixels = frame.film.width * frame.film.height;
+        if pixels > MAX_PIXELS {
+            let found = format!("the picture has {pixels} pixels; accepted: {MAX_PIXELS}. The run folder holds its files");
+            return Err((StatusCode::PAYLOAD_TOO_LARGE, found));
+        }
+        let (ending, media_type) = file.form();
+        let name = format!("{run}-frame-{:06}-slide-{:04}.{ending}", frame.record.frame, frame.record.slide);
+        let encoded = tokio::task::spawn_blocking(move || file.encode(&frame)).await;
+        let failed = |error: String| (StatusCode::INTERNAL_SERVER_ERROR, format!("{name} cannot be made: {error}"));
+        let bytes = encoded.map_err(|error| failed(error.to_string()))?.map_err(failed)?;
+        let disposition = format!("attachment; filename=\"{name}\"");
+        Ok((
+            [(CONTENT_TYPE, media_type.to_owned()), (CONTENT_DISPOSITION, disposition)],
+            Bytes::from_owner(Sent { bytes, _permit: permit }),
+        )
+            .into_response())
+    }
+}
+
+fn refused((status, words): Refusal) -> Response {
+    (status, words + "\n").into_response()
+}
+
+fn bad(name: &str, found: &str, accepted: &str) -> Refusal {
+    let found: String = found.chars().take(32).collect();
+    (StatusCode::BAD_REQUEST, format!("`{name}` is \"{found}\"; accepted: {accepted}"))
+}
+
+fn whole(name: &str, text: &str, accepted: &str) -> Result<u64, Refusal> {
+    text.parse().map_err(|_| bad(name, text, accepted))
+}

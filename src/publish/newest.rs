@@ -1,0 +1,92 @@
+//! The newest frame of a run in memory, for those who ask about its pixels or want it as a file.
+
+use crate::run::Frame;
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+/// Keeps one frame: the newest. Its picture is shared with those who publish and write it, not copied.
+#[derive(Debug)]
+pub struct NewestFrame {
+    run: String,
+    frame: Mutex<Option<Frame>>,
+}
+
+/// Why a frame is not there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NoFrame {
+    /// No frame is complete yet.
+    NotYet,
+    /// Another one is kept by now.
+    MovedOn {
+        /// Number of the one that was asked for.
+        wanted: u64,
+        /// Number of the one that is kept.
+        kept: u64,
+    },
+}
+
+impl NewestFrame {
+    /// Of the run that writes into this folder, whose name goes into the names of files.
+    pub fn new(folder: &Path) -> Self {
+        let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        // What every file system and a quoted string of HTTP accept.
+        let run: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
+        Self { run: if run.is_empty() { "run".to_owned() } else { run }, frame: Mutex::default() }
+    }
+
+    /// Name of the run in names of files: letters, digits, `-`, `_` and `.`.
+    pub fn run(&self) -> &str {
+        &self.run
+    }
+
+    /// Keeps this frame in place of the one before.
+    pub fn put(&self, frame: Frame) {
+        let before = self.lock().replace(frame);
+        // A large picture is given back to the system without the lock.
+        drop(before);
+    }
+
+    /// The frame of this number, or the newest one.
+    ///
+    /// # Errors
+    /// It is not there.
+    pub fn get(&self, wanted: Option<u64>) -> Result<Frame, NoFrame> {
+        let newest = self.lock().clone().ok_or(NoFrame::NotYet)?;
+        match wanted.filter(|wanted| *wanted != newest.record.frame) {
+            Some(wanted) => Err(NoFrame::MovedOn { wanted, kept: newest.record.frame }),
+            None => Ok(newest),
+        }
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Frame>> {
+        self.frame.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::Film;
+    use crate::run::FrameRecord;
+    use std::sync::{Arc, Weak};
+
+    fn frame(number: u64) -> (Frame, Weak<Film>) {
+        let film = Arc::new(Film::new(4, 2));
+        let (record, weak) = (FrameRecord { frame: number, ..Default::default() }, Arc::downgrade(&film));
+        (Frame { record: Arc::new(record), film, tone_map: [1.0, 0.5, 1.0], color_bar: None }, weak)
+    }
+
+    #[test]
+    fn one_frame_is_kept_and_an_earlier_one_is_freed() {
+        let newest = NewestFrame::new(Path::new("out/some run\"1"));
+        assert_eq!(newest.run(), "some_run_1");
+        assert_eq!(NewestFrame::new(Path::new("..")).run(), "run");
+        assert_eq!(newest.get(None).unwrap_err(), NoFrame::NotYet);
+        let ((first, film), (second, _)) = (frame(3), frame(4));
+        newest.put(first);
+        assert_eq!((newest.get(None).unwrap().record.frame, newest.get(Some(3)).unwrap().record.frame), (3, 3));
+        newest.put(second);
+        assert_eq!(newest.get(Some(3)).unwrap_err(), NoFrame::MovedOn { wanted: 3, kept: 4 });
+        assert!(film.upgrade().is_none(), "the first picture is no longer in memory");
+    }
+}

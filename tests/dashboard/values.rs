@@ -1,0 +1,233 @@
+//! Values of pixels and downloads: those of the frame's EXR, and why there are none.
+
+use crate::kit::program::{Running, ridgewatch, set, start, text, until};
+use crate::kit::publishing;
+use crate::kit::scene::{self, double_gyre};
+use crate::visitor::{Visitor, ask, get};
+use crate::{LIMIT, Stage};
+use ridgewatch::publish::{NewestFrame, channels_at, decode_exr, png, read_exr};
+use ridgewatch::render::Film;
+use ridgewatch::run::{ColorBar, Frame, FrameRecord};
+use serde_json::{Value, json};
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// A film whose pixels all differ, with an error a pixel or without.
+fn film([width, height]: [usize; 2], has_error: bool) -> Film {
+    let pixels = width * height;
+    let layer = |from: f32| (0..pixels).map(|i| from + (i as f32).sqrt()).collect::<Vec<_>>();
+    let mut film = Film { ftle_mean: layer(0.1), traced: layer(1.0), samples: vec![4.0; pixels], ..Film::new(width, height) };
+    film.rgba = (0..pixels).map(|i| [i as f32 / 7.0, 1.0 / (i as f32 + 3.0), -0.25, 1.0]).collect();
+    film.ftle_mean[1] = f32::NAN;
+    film.error = if has_error { layer(1e-3) } else { Vec::new() };
+    film
+}
+
+fn frame(number: u64, film: Film) -> Frame {
+    let record = FrameRecord { frame: number, slide: 2, size: [film.width, film.height], method: "gated".into(), ..Default::default() };
+    let bar = ColorBar { colors: vec![[1, 2, 3]; 32], low: 0.5, high: 2.0, unit: "1/day".into() };
+    Frame { color_bar: Some(Arc::new(bar)), ..publishing::frame(record, film) }
+}
+
+fn stage(frame: Option<Frame>) -> (Stage, Arc<NewestFrame>) {
+    let newest = Arc::new(NewestFrame::new(Path::new("out/gulf")));
+    frame.into_iter().for_each(|frame| newest.put(frame));
+    (Stage::with(tempfile::tempdir().unwrap(), None, Some(Arc::clone(&newest))), newest)
+}
+
+fn body(answer: &str) -> &str {
+    answer.split_once("\r\n\r\n").unwrap().1
+}
+
+/// Head and bytes of an answer.
+fn bytes(address: SocketAddr, target: &str) -> (String, Vec<u8>) {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(LIMIT)).unwrap();
+    write!(stream, "GET {target} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let end = answer.windows(4).position(|part| part == b"\r\n\r\n").unwrap();
+    (String::from_utf8_lossy(&answer[..end]).into_owned(), answer[end + 4..].to_vec())
+}
+
+/// The channels of a JSON answer are those of the film at that pixel, to the last bit.
+fn agrees(values: &Value, film: &Film) {
+    let pixel = [values["x"].as_u64().unwrap() as usize, values["y"].as_u64().unwrap() as usize];
+    let expected = channels_at(film, pixel);
+    assert_eq!(values["channels"].as_object().unwrap().len(), expected.len(), "{values}");
+    for (name, value) in expected {
+        let told = &values["channels"][name];
+        match told.as_f64() {
+            Some(told) => assert_eq!((told as f32).to_bits(), value.to_bits(), "{name} {values}"),
+            None => assert!(told.is_null() && !value.is_finite(), "{name} {values}"),
+        }
+    }
+}
+
+#[test]
+fn a_pixel_has_the_values_of_the_exr_that_is_downloaded() {
+    let (stage, _newest) = stage(Some(frame(12, film([9, 4], true))));
+    let (address, token) = (stage.address(), &stage.token);
+    let (head, exr) = bytes(address, &format!("/node/a/frame.exr?token={token}&frame=12"));
+    assert!(head.starts_with("HTTP/1.1 200") && head.contains("filename=\"gulf-frame-000012-slide-0002.exr\""), "{head}");
+    let film = decode_exr(&exr).unwrap();
+    assert_eq!((film.width, film.height, film.error.len()), (9, 4, 36));
+    for (x, y) in (0..36).map(|pixel| (pixel % 9, pixel / 9)) {
+        let (status, answer) = get(address, &format!("/values?token={token}&x={x}&y={y}"), &[]);
+        assert_eq!(status, 200, "{answer}");
+        let values: Value = serde_json::from_str(body(&answer)).unwrap();
+        assert_eq!((&values["x"], &values["y"], &values["frame"], &values["unit"]), (&json!(x), &json!(y), &json!(12), &json!("1/day")));
+        assert!(values.get("no_error").is_none());
+        agrees(&values, &film);
+    }
+    let (head, picture) = bytes(address, &format!("/frame.png?token={token}"));
+    assert!(head.contains("content-type: image/png") && head.contains("gulf-frame-000012-slide-0002.png"), "{head}");
+    assert_eq!(picture, png(&film, [1.0, 0.5, 1.0]).unwrap());
+    let (head, record) = bytes(address, &format!("/frame.json?token={token}"));
+    assert!(head.contains("gulf-frame-000012-slide-0002.json"), "{head}");
+    assert_eq!(serde_json::from_slice::<FrameRecord>(&record).unwrap().frame, 12);
+}
+
+#[test]
+fn what_cannot_be_told_is_said_in_words() {
+    let (stage, newest) = stage(None);
+    let (address, token) = (stage.address(), stage.token.clone());
+    let said = |target: &str| get(address, &format!("{target}token={token}"), &[]);
+    let refused = |target: &str, status: u16, words: &str| {
+        let (found, answer) = said(target);
+        assert!(found == status && body(&answer).contains(words), "{target}: {answer}");
+    };
+    refused("/values?x=0&y=0&", 404, "no frame is complete yet");
+    refused("/frame.exr?", 404, "no frame is complete yet");
+    newest.put(frame(7, film([9, 4], false)));
+    newest.put(frame(8, film([9, 4], false)));
+    refused("/values?x=0&y=0&frame=7&", 410, "frame 7 is no longer kept: the run keeps its newest one, 8 by now");
+    refused("/frame.exr?frame=7&", 410, "frame 7 is no longer kept");
+    for (query, words) in [
+        ("x=9&y=0&", "`x` is \"9\"; accepted: a pixel of the picture, 0 to 8"),
+        ("x=0&y=4&", "`y` is \"4\"; accepted: a pixel of the picture, 0 to 3"),
+        ("x=-1&y=0&", "`x` is \"-1\""),
+        ("x=18446744073709551616&y=0&", "`x` is \"18446744073709551616\""),
+        ("y=0&", "`x` is \"\""),
+        ("x=0&y=0&frame=new&", "`frame` is \"new\"; accepted: the number of a frame"),
+    ] {
+        refused(&format!("/values?{query}"), 400, words);
+    }
+    let (status, answer) = said("/values?x=0&y=0&frame=8&");
+    let values: Value = serde_json::from_str(body(&answer)).unwrap();
+    assert!(status == 200 && values["channels"].get("error").is_none());
+    assert_eq!(values["no_error"], "gated states no error of a pixel; marched and two_level do");
+    // A process of its own has no frames, and its pages know before they ask.
+    let alone = Stage::new();
+    let state = alone.visit().until_state(|_| true);
+    assert!(state["values"]["none"].as_str().unwrap().contains("beside the run"), "{state}");
+    let (status, answer) = get(alone.address(), &format!("/values?x=0&y=0&token={}", alone.token), &[]);
+    assert!(status == 404 && answer.contains("with --dashboard the run serves them"), "{answer}");
+    assert_eq!(stage.visit().until_state(|_| true)["values"], json!({"ready": "gulf"}));
+}
+
+#[test]
+fn frames_go_to_those_who_know_a_token() {
+    let (stage, _newest) = stage(Some(frame(1, film([9, 4], true))));
+    let address = stage.address();
+    let watching = stage.dashboard.watching_url().split("token=").nth(1).unwrap().to_owned();
+    for target in ["/values?x=0&y=0&", "/frame.exr?", "/frame.png?", "/frame.json?"] {
+        assert_eq!(get(address, &format!("{target}token={watching}"), &[]).0, 200, "{target}");
+        assert_eq!(get(address, &format!("{target}token={}", stage.token), &[]).0, 200, "{target}");
+        for wrong in ["", "token=", "token=0", &format!("token={watching}0")] {
+            let (status, answer) = get(address, &format!("{target}{wrong}"), &[]);
+            assert!(status == 403 && !answer.contains("channels") && !answer.contains("filename"), "{target} {wrong}");
+        }
+        let elsewhere = "Origin: https://evil.example.org";
+        assert_eq!(get(address, &format!("{target}token={watching}"), &[elsewhere]).0, 403, "{target}");
+        let request = format!("GET {target}token={watching} HTTP/1.1\r\nHost: evil.example.org\r\nConnection: close\r\n\r\n");
+        assert_eq!(ask(address, &request).0, 403);
+    }
+}
+
+#[test]
+fn what_is_too_large_is_refused() {
+    // 2^24 pixels and a row: never encoded, so that the film needs no colours.
+    let (stage, newest) = stage(Some(frame(1, Film { width: 4096, height: 4097, ..Film::default() })));
+    let (address, token) = (stage.address(), &stage.token);
+    for file in ["exr", "png"] {
+        let (status, answer) = get(address, &format!("/frame.{file}?token={token}"), &[]);
+        assert!(status == 413 && answer.contains("16781312 pixels; accepted: 16777216"), "{answer}");
+    }
+    newest.put(frame(2, film([9, 4], true)));
+    let target = format!("/values?x=0&y=0&token={token}");
+    for (lines, status) in [
+        ("Content-Length: 0\r\n", 200),
+        ("Content-Length: 1\r\n", 413),
+        ("Content-Length: 99999999999\r\n", 413),
+        ("Transfer-Encoding: chunked\r\n", 413),
+        (&format!("X-Long: {}\r\n", "a".repeat(20_000)), 431),
+    ] {
+        let found = ask(address, &format!("GET {target} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n{lines}\r\n"));
+        assert_eq!(found.0, status, "{} {}", lines.len(), found.1);
+    }
+    let (status, answer) = get(address, &format!("/values?x={}&y=0&token={token}", "9".repeat(8000)), &[]);
+    assert!(status == 400 && answer.len() < 1000, "{answer}");
+}
+
+/// One who takes a file slowly keeps others from files for as long, and from nothing else.
+#[test]
+fn one_file_is_on_its_way_at_once() {
+    let noise = |i: usize| (i as u32).wrapping_mul(2_654_435_761) as f32;
+    let mut large = film([2048, 1024], true);
+    // It cannot be compressed: no buffer of a socket takes all of it.
+    large.rgba.iter_mut().enumerate().for_each(|(i, rgba)| *rgba = [noise(i), noise(i + 1), noise(i + 2), 1.0]);
+    let (stage, _newest) = stage(Some(frame(1, large)));
+    let (address, token) = (stage.address(), &stage.token);
+    let mut slow = TcpStream::connect(address).unwrap();
+    slow.set_read_timeout(Some(LIMIT)).unwrap();
+    write!(slow, "GET /frame.exr?token={token} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+    slow.read_exact(&mut [0; 64]).unwrap();
+    let (status, answer) = get(address, &format!("/frame.png?token={token}"), &[]);
+    assert!(status == 503 && answer.contains("another file is on its way"), "{answer}");
+    assert_eq!(get(address, &format!("/values?x=0&y=0&token={token}"), &[]).0, 200);
+    drop(slow);
+    let end = Instant::now() + LIMIT;
+    while get(address, &format!("/frame.json?token={token}"), &[]).0 == 503 {
+        assert!(Instant::now() < end, "its place is free again");
+    }
+}
+
+fn url(running: &Running) -> (SocketAddr, String) {
+    until("an address", || running.stdout().contains('}'));
+    let printed: Value = serde_json::Deserializer::from_str(&running.stdout()).into_iter().next().unwrap().unwrap();
+    let (address, token) = printed["url"].as_str().unwrap().strip_prefix("http://").unwrap().split_once("/?token=").unwrap();
+    (address.parse().unwrap(), token.to_owned())
+}
+
+#[test]
+fn a_run_tells_the_values_of_the_exr_that_it_writes() {
+    let folder = tempfile::tempdir().unwrap();
+    let lines = "time.tau = 10\ntime.slides = 10000\nrender.method = \"two_level\"\nsurrogate.kind = \"table\"\n";
+    let scene = scene::write(folder.path(), &double_gyre([32, 16, 1], lines));
+    let run = folder.path().join("gyre");
+    let mut replay = ridgewatch(["replay", &scene, "--json", "--out", text(&run), "--dashboard=0"]);
+    let endpoint = format!("ipc://{}", folder.path().join("frames").display());
+    replay.args(["--publish", &endpoint]).args(set(&["flow.steps=20", "publish.preview=false", "publish.exr=\"every\""]));
+    let running = start(&mut replay);
+    let (address, token) = url(&running);
+    Visitor::open(address, &token).frame();
+    let mut told = Vec::new();
+    for pixel in 0..32 {
+        let (status, answer) = get(address, &format!("/values?x={pixel}&y={}&token={token}", pixel / 2), &[]);
+        assert_eq!(status, 200, "{answer}");
+        told.push(serde_json::from_str::<Value>(body(&answer)).unwrap());
+    }
+    let (head, _) = bytes(address, &format!("/frame.json?token={token}"));
+    assert!(head.contains("filename=\"gyre-frame-"), "{head}");
+    running.signal(libc::SIGTERM);
+    running.wait();
+    for values in told {
+        assert!(values["channels"]["error"].as_f64().unwrap() > 0.0, "{values}");
+        let film = read_exr(&run.join(format!("frames/frame_{:06}.exr", values["frame"].as_u64().unwrap()))).unwrap();
+        agrees(&values, &film);
+    }
+}
