@@ -5,6 +5,7 @@
 
 mod compare;
 mod error;
+mod export;
 mod exr;
 mod file_writer;
 mod message;
@@ -18,6 +19,7 @@ mod zmq;
 
 pub use compare::{CompareError, Comparison, compare_files, compare_films};
 pub use error::PublishError;
+pub use export::{Field, FieldExport, FieldFormat, FieldFrame};
 pub use exr::{decode_exr, encode_exr, read_exr, write_exr};
 pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
 pub use output::Output;

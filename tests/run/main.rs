@@ -5,6 +5,7 @@ mod archives;
 mod checkpoints;
 mod command_line;
 mod default_tau;
+mod export;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod messages;
