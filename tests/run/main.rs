@@ -9,6 +9,7 @@ mod export;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod messages;
+mod movie;
 #[path = "../network_support/mod.rs"]
 mod network_support;
 mod scene_file;
