@@ -189,18 +189,22 @@ impl Positions {
         let velocity = &listing.variables[listing.find(&component.name)?];
         let (&dx, &dy) = (velocity.dimensions.last()?, velocity.dimensions.iter().rev().nth(1)?);
         let find = |kind: Kind| {
-            let fits = |v: &Variable| v.dimensions == [dy, dx] && v.number.is_number() && classify(v) == kind;
+            // Packed values are not unpacked here.
+            let plain = |v: &Variable| v.attribute("scale_factor").is_none() && v.attribute("add_offset").is_none();
+            let in_degrees = |v: &Variable| v.units().is_none_or(|unit| unit.to_ascii_lowercase().starts_with("degree"));
+            let fits = |v: &Variable| v.dimensions == [dy, dx] && v.number.is_number() && classify(v) == kind && plain(v) && in_degrees(v);
             listing.variables.iter().position(fits)
         };
         let (longitude, latitude) = (find(Kind::Longitude)?, find(Kind::Latitude)?);
-        let read = |index: usize| {
-            let shape = listing.shape(&listing.variables[index]);
-            file.read(index, vec![0, 0], shape).ok()
-        };
+        let read = |index: usize| file.read_all(index).ok();
         let values = [read(longitude)?, read(latitude)?];
         let width = listing.dimensions[dx].len;
         let [x, y] = [&layout.axes[0], &layout.axes[1]];
-        let node = |i: &usize, j: &usize| [0, 1].map(|k| values[k].get(j * width + i).copied().unwrap_or(f64::NAN));
+        // Fill values are no degrees.
+        let node = |i: &usize, j: &usize| {
+            let degrees = [0, 1].map(|k| values[k].get(j * width + i).copied().unwrap_or(f64::NAN));
+            if degrees[0].abs() <= 720.0 && degrees[1].abs() <= 90.0 { degrees } else { [f64::NAN; 2] }
+        };
         Some(Self {
             names: [longitude, latitude].map(|index| listing.variables[index].name.clone()),
             x: x.axis.coordinates().to_vec(),

@@ -5,8 +5,8 @@ use gif::{DisposalMethod, EncodingError, Frame, Repeat};
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 
-/// Share of the pixels from which the palette is learned: one in ten, the crate's compromise between speed and quality.
-const SPEED: i32 = 10;
+/// Pixels from which a palette is learned, about: all of a small picture, and one in ten of a large one.
+const LEARNED: usize = 100_000;
 
 pub(super) struct Gif {
     encoder: gif::Encoder<BufWriter<File>>,
@@ -28,7 +28,8 @@ impl Gif {
 
 impl Encoder for Gif {
     fn add(&mut self, rgb: &[u8]) -> io::Result<()> {
-        let mut frame = Frame::from_rgb_speed(self.size[0], self.size[1], rgb, SPEED);
+        let speed = (rgb.len() / 3 / LEARNED).clamp(1, 10) as i32;
+        let mut frame = Frame::from_rgb_speed(self.size[0], self.size[1], rgb, speed);
         // Hundredths of a second, rounded so that the film as a whole keeps its rate.
         let end = |frames: u64| (frames as f64 * 100.0 / self.frames_per_second).round();
         frame.delay = (end(self.written + 1) - end(self.written)) as u16;
