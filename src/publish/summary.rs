@@ -148,6 +148,9 @@ impl MovieStatistics {
         let Self { file, frames_written, frames_lost, failed } = self;
         let lost = if *frames_lost > 0 { format!(", {frames_lost} left out") } else { String::new() };
         let failed = failed.as_ref().map_or_else(String::new, |why| format!("; it ends early: {why}"));
+        if *frames_written == 0 {
+            return format!("no frame for the film {file}{lost}{failed}");
+        }
         format!("film of {frames_written} frames{lost} in {file}{failed}")
     }
 }
