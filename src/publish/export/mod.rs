@@ -174,7 +174,7 @@ pub struct FieldExport {
 }
 
 enum Files {
-    Cf(Box<CfFile>),
+    Cf(CfFile),
     Vtk(VtkFiles),
 }
 
@@ -187,7 +187,7 @@ impl FieldExport {
         let kind = match format {
             FieldFormat::NetCdf => {
                 let files = CfFile::create(path, frame).map_err(|e| failed(path, e))?;
-                return Ok(Self { path: path.to_owned(), files: Files::Cf(Box::new(files)) });
+                return Ok(Self { path: path.to_owned(), files: Files::Cf(files) });
             }
             FieldFormat::VtkImage => VtkKind::Image,
             FieldFormat::VtkRectilinear => VtkKind::Rectilinear,
