@@ -345,7 +345,7 @@ fn check((name, truth): &(&'static str, Vec<f64>), tracer: &dyn Tracer, seeds: &
     let peak = pairs.iter().map(|(_, b)| *b).fold(0.0, f64::max);
     let relative = pairs.iter().map(|(a, b)| (a - b).abs() / b.abs()).fold(0.0, f64::max);
     Ok(Check {
-        truth: *name,
+        truth: name,
         compared: pairs.len(),
         rms,
         maximum,

@@ -57,7 +57,7 @@ mod tests {
         assert!(rows(0, 130).iter().all(|&c| c == 100), "above it nothing changes");
         assert!(rows(140, 160).iter().any(|&c| c > 150) && rows(140, 160).iter().any(|&c| c < 60), "light text on a dark ground");
         // Also where there is no room.
-        annotate(&mut vec![0; 27], [3, 3], &record).unwrap();
+        annotate(&mut [0; 27], [3, 3], &record).unwrap();
         assert_eq!(words(&record), "t = 2.5 s");
     }
 }

@@ -59,7 +59,6 @@ fn a_gif_holds_the_pictures_of_the_run() {
         assert_eq!(frame.dimensions(), picture.dimensions());
         let off = difference(frame, picture);
         let fixed = difference(&fixed_palette(picture), picture);
-        println!("{off:.3} levels of 255, with one palette for all pictures {fixed:.3}");
         assert!(off < fixed / 2.0, "256 colours that are chosen for the picture: {off} {fixed}");
     }
     assert!(difference(&frames[0], &pictures[5]) > difference(&frames[0], &pictures[0]));
@@ -137,7 +136,6 @@ fn an_mp4_holds_the_frames_of_the_run() {
     for (frame, picture) in raw.chunks(162 * 82 * 3).zip(pictures(&folder.path().join("run"))) {
         let frame = RgbImage::from_raw(162, 82, frame.to_vec()).unwrap();
         let off = difference(&image::imageops::crop_imm(&frame, 0, 0, 161, 81).to_image(), &picture);
-        println!("{off:.3} levels of 255");
         // Colours have half the pixels along each edge, and the picture is noise of two samples.
         assert!(off < 4.0, "{off}");
     }
