@@ -2,6 +2,8 @@
 # make test            runs the whole suite and compiles the GPU kernels (NVRTC is fetched into target/); tests of real archives run if the archives are present
 # make test-data       runs only the tests of real archives; RIDGEWATCH_DATA=folder names the folder of the archives
 # make test-reader     tests the NumPy reader of networks
+# make test-exports    checks exported fields with cfchecks and xarray, which go into target/exports; installs libudunits2-0 if apt is available
+# make test-movies     tests films in MP4; installs ffmpeg if apt is available
 # make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
 # make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
 #                      with root also from another user, a Python client that steers, and `make fuzz`
@@ -35,6 +37,9 @@ CARGO_FUZZ_VERSION := 0.13.2
 # Checks the dependencies.
 CARGO_DENY := target/cargo-deny
 CARGO_DENY_VERSION := 0.19.0
+# The CF checker, and the table of standard names that it looks words up in.
+EXPORTS := target/exports
+CFCHECKER_VERSION := 4.1.0
 FUZZ_TARGETS := ring message zmtp netcdf checkpoint scene
 FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
@@ -51,7 +56,7 @@ PREFIX ?= /usr/local
 SONAME := libridgewatch_adapter.so.$(shell sed -n 's/^.define RW_VERSION //p' adapters/c/include/ridgewatch.h)
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-dashboard test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-exports test-movies test-dashboard test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -109,6 +114,26 @@ test-data: packages .venv/installed
 
 test-reader: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test network_reader -- --ignored
+
+$(EXPORTS)/done: Makefile | python-packages
+	$(PYTHON) -m venv $(EXPORTS)/venv
+	$(EXPORTS)/venv/bin/pip install --quiet cfchecker==$(CFCHECKER_VERSION) netCDF4 xarray
+	$(EXPORTS)/venv/bin/pip install --quiet --no-deps --upgrade --target $(EXPORTS)/tables compliance-checker
+	touch $@
+
+test-exports: packages
+	$(CARGO) build --release --bin ridgewatch
+	@ldconfig -p | grep -q libudunits2 || { command -v apt-get >/dev/null && $(SUDO) apt-get update -qq && \
+	  $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq libudunits2-0 >/dev/null || true; }
+	@if ! ldconfig -p | grep -q libudunits2; then echo "NOT RUN: the checks of exported fields, since libudunits2 is not installed"; \
+	elif ! $(MAKE) --no-print-directory $(EXPORTS)/done; then echo "NOT RUN: the checks of exported fields, since their Python packages could not be fetched"; \
+	else scripts/check-exports target/release/ridgewatch $(EXPORTS)/venv $(EXPORTS)/tables $(wildcard $(RIDGEWATCH_DATA)); fi
+
+test-movies: packages
+	@command -v ffmpeg >/dev/null || { command -v apt-get >/dev/null && $(SUDO) apt-get update -qq && \
+	  $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq ffmpeg >/dev/null || true; }
+	@if command -v ffmpeg >/dev/null; then $(CARGO) test --release --test run movie:: -- --ignored; else \
+	  echo "NOT RUN: the tests of films in MP4, since ffmpeg is not installed"; fi
 
 # The dashboard's page in Debian's Chromium, with Node's test runner.
 test-dashboard: packages

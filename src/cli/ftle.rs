@@ -2,15 +2,17 @@
 
 use super::common::{Common, Usage, check_folder, chosen_steps, device, dimensions, located, open, print_json, print_text, scene};
 use super::messages;
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use ridgewatch::backend::{Device, TracedOnce};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::publish::{Field, FieldExport, FieldFormat, FieldFrame};
 use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
+use ridgewatch::source::utc;
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 /// Options of `ftle`.
@@ -24,17 +26,53 @@ pub struct Options {
     #[arg(long, default_value = "201x101", value_parser = grid)]
     grid: [usize; 3],
     /// Slide of the window, from 0.
-    #[arg(long, default_value_t = 0, value_name = "N")]
+    #[arg(long, default_value_t = 0, value_name = "N", conflicts_with = "slides")]
     slide: u64,
+    /// Several slides, one after the other: all, N, or A..B (both included). With --out, NetCDF holds them along `time`; VTK has a file for each, and
+    /// a .pvd that names them all.
+    #[arg(long, value_name = "all | N | A..B", value_parser = slides)]
+    slides: Option<Wanted>,
     /// Compare the field with its closed form if it has one, else with Dormand-Prince integration in f64.
     #[arg(long)]
     check: bool,
     /// Print the error for 5, 10, 20 ... 160 steps (in f64) against the same truth, and the order of convergence.
     #[arg(long)]
     convergence: bool,
-    /// NetCDF file; by default nothing is written.
-    #[arg(long, short)]
+    /// File of the field, with its lifetimes and errors (those of each seed with --check); by default nothing is written.
+    #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Format of the file: netcdf (CF conventions), vti, vtr or vts (VTK image data, rectilinear, structured), or vtk for vti; by default that of
+    /// its extension, and netcdf for others.
+    #[arg(long, value_name = "FORMAT", value_parser = format, requires = "out")]
+    format: Option<FieldFormat>,
+}
+
+/// Slides from the first to the last.
+#[derive(Debug, Clone, Copy)]
+struct Wanted {
+    first: u64,
+    /// `None`: to the end of the source.
+    last: Option<u64>,
+}
+
+fn slides(text: &str) -> Result<Wanted, String> {
+    let number = |text: &str| text.trim().parse::<u64>().ok().filter(|n| *n < u64::MAX);
+    let wanted = match text.split_once("..") {
+        None if text == "all" => Some(Wanted { first: 0, last: None }),
+        None => number(text).map(|n| Wanted { first: n, last: Some(n) }),
+        Some((first, last)) => number(first).zip(number(last)).map(|(first, last)| Wanted { first, last: Some(last) }),
+    };
+    wanted.filter(|w| w.last.is_none_or(|last| w.first <= last)).ok_or_else(|| "accepted: all, N, or A..B with A at most B".into())
+}
+
+fn format(text: &str) -> Result<FieldFormat, String> {
+    Ok(match text {
+        "netcdf" => FieldFormat::NetCdf,
+        "vtk" | "vti" => FieldFormat::VtkImage,
+        "vtr" => FieldFormat::VtkRectilinear,
+        "vts" => FieldFormat::VtkStructured,
+        _ => return Err("accepted: netcdf, vtk, vti, vtr, vts".into()),
+    })
 }
 
 fn grid(text: &str) -> Result<[usize; 3], String> {
@@ -76,6 +114,13 @@ struct Report {
     file: Option<PathBuf>,
 }
 
+/// Reports of several slides.
+#[derive(Serialize)]
+struct Series {
+    slides: Vec<Report>,
+    file: Option<PathBuf>,
+}
+
 #[derive(Serialize)]
 struct Check {
     truth: &'static str,
@@ -104,30 +149,60 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     if let Some(out) = &options.out {
         check_folder(out)?;
     }
-    let mut slide = None;
-    for _ in 0..=options.slide {
-        slide = slides.next_slide(&AtomicBool::new(false)).map_err(faulty)?;
-        if slide.is_none() {
-            bail!(Usage(format!("--slide {}: the source has fewer slides", options.slide)));
-        }
+    let wanted = options.slides.unwrap_or(Wanted { first: options.slide, last: Some(options.slide) });
+    let option = if options.slides.is_some() { "--slides" } else { "--slide" };
+    let few = |wanted: u64, there: u64| {
+        Usage(format!("{option} {wanted}: the source has fewer slides: {there}, counted from 0 (time.slides limits them)"))
+    };
+    // Before any work.
+    if let (Some(there), last) = (slides.expected(), wanted.last.unwrap_or(wanted.first))
+        && last >= there
+    {
+        bail!(few(last, there));
     }
-    let slide = slide.context("the source gave no slide")?;
     let device = device(common, &scene)?;
-    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<RunError>() {
-        Ok(error) => located(&scene, error, RunError::refused),
-        Err(error) => match error.downcast::<FlowError>() {
-            Ok(error) => located(&scene, error, FlowError::refused),
-            Err(error) => error,
-        },
-    })?;
-    if common.json {
-        return print_json(&report);
+    let mut export = None;
+    let mut reports = Vec::new();
+    for index in 0..=wanted.last.unwrap_or(u64::MAX - 1) {
+        let Some(slide) = slides.next_slide(&AtomicBool::new(false)).map_err(faulty)? else {
+            if wanted.last.is_some() || reports.is_empty() {
+                bail!(few(wanted.last.unwrap_or(wanted.first), index));
+            }
+            break;
+        };
+        if index < wanted.first {
+            continue;
+        }
+        let report = compute(&plan, &slide, options, &device, &mut export).map_err(|error| match error.downcast::<RunError>() {
+            Ok(error) => located(&scene, error, RunError::refused),
+            Err(error) => match error.downcast::<FlowError>() {
+                Ok(error) => located(&scene, error, FlowError::refused),
+                Err(error) => error,
+            },
+        })?;
+        if !common.json {
+            print_report(&report);
+        }
+        reports.push(report);
     }
-    print_report(&report);
+    let file = export.map(FieldExport::finish).transpose()?;
+    match (&file, common.json, options.slides) {
+        (Some(file), false, _) => print_text(format_args!("written to {}", file.display())),
+        (None, false, _) => {}
+        (_, true, Some(_)) => return print_json(&Series { slides: reports, file }),
+        (_, true, None) => return reports.pop().map_or(Ok(()), |report| print_json(&Report { file, ..report })),
+    }
     Ok(())
 }
 
-fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Result<Report> {
+/// Words of the command line, with the date, for the history of a file.
+fn history() -> String {
+    let words = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned());
+    format!("{} ridgewatch {}", utc(std::time::SystemTime::now()), words.collect::<Vec<_>>().join(" "))
+}
+
+/// Computes one field and, with `--out`, adds it to the file, which the first one begins.
+fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device, export: &mut Option<FieldExport>) -> Result<Report> {
     let mut grid = options.grid;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}
@@ -154,19 +229,37 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(RunError::of)?;
     note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
-    let ftle: Vec<f64> =
-        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_missing(seed) { f64::NAN } else { s / tau }).collect();
+    let without: Vec<bool> = seeds.iter().map(|seed| tracer.is_missing(*seed)).collect();
+    let ftle: Vec<f64> = unrounded(&traced).iter().zip(&without).map(|(s, &missing)| if missing { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
-    let missing = seeds.iter().filter(|seed| tracer.is_missing(**seed)).count();
+    let missing = without.iter().filter(|missing| **missing).count();
     if options.check || options.convergence {
         spinner.set_message(format!("integrating {} seeds for comparison", seeds.len()));
     }
-    let check = if options.check { Some(check(plan, slide, &*tracer, &seeds, &ftle)?) } else { None };
+    let truth = if options.check { Some(truth(plan, slide, &seeds)?) } else { None };
+    let check = truth.as_ref().map(|truth| check(truth, &*tracer, &seeds, &ftle)).transpose()?;
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
     spinner.finish_and_clear();
     if let Some(out) = &options.out {
-        write(out, plan, slide, &*tracer, grid, &ftle, &traced.lifetime_share)
-            .with_context(|| format!("cannot write {}", out.display()))?;
+        let export = match export {
+            Some(export) => export,
+            None => {
+                let integrator = format!("{}, {}", word(plan.map.integrator), word(plan.map.precision));
+                let frame = FieldFrame::new(plan, slide, grid, integrator, history(), truth.as_ref().map(|(name, _)| *name));
+                let format = options.format.unwrap_or_else(|| FieldFormat::of(out));
+                export.insert(FieldExport::create(out, format, frame, options.slides.is_some())?)
+            }
+        };
+        let error: Option<Vec<f64>> = truth.as_ref().map(|(_, truth)| ftle.iter().zip(truth).map(|(a, b)| (a - b).abs()).collect());
+        export.add(&Field {
+            time: slide.time,
+            ftle: &ftle,
+            lifetime_share: &traced.lifetime_share,
+            missing: &without,
+            error: error.as_deref(),
+            error_of_steps: difference_of_steps(&*tracer).map(|difference| difference / tau),
+            steps: tracer.steps(),
+        })?;
     }
     Ok(Report {
         time: slide.time,
@@ -190,7 +283,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         samples_per_second: seeds.len() as f64 / seconds,
         check,
         convergence,
-        file: options.out.clone(),
+        file: None,
     })
 }
 
@@ -246,9 +339,8 @@ fn ftle(map: &FlowMap, slide: &Slide, seeds: &[DomainPoint]) -> Result<Vec<f64>>
     Ok(unrounded(&traced).iter().map(|s| s / map.tau).collect())
 }
 
-fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[DomainPoint], ftle: &[f64]) -> Result<Check> {
-    let (name, truth) = truth(plan, slide, seeds)?;
-    let pairs = comparable(tracer, seeds, ftle, &truth)?;
+fn check((name, truth): &(&'static str, Vec<f64>), tracer: &dyn Tracer, seeds: &[DomainPoint], ftle: &[f64]) -> Result<Check> {
+    let pairs = comparable(tracer, seeds, ftle, truth)?;
     let (rms, maximum) = difference(&pairs);
     let peak = pairs.iter().map(|(_, b)| *b).fold(0.0, f64::max);
     let relative = pairs.iter().map(|(a, b)| (a - b).abs() / b.abs()).fold(0.0, f64::max);
@@ -292,77 +384,6 @@ fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[DomainP
     Ok(Convergence { truth: name, steps, rms, order })
 }
 
-/// Writes the field under a temporary name and renames it, so that an unfinished file never has the final name.
-fn write(
-    out: &Path,
-    plan: &Plan,
-    slide: &Slide,
-    tracer: &dyn Tracer,
-    grid: [usize; 3],
-    ftle: &[f64],
-    lifetime_share: &[f32],
-) -> Result<()> {
-    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    // Mode by the umask; by default temporary files are private.
-    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o666);
-    let temporary = tempfile::Builder::new().prefix(".ridgewatch-").suffix(".nc").permissions(mode).tempfile_in(folder)?.into_temp_path();
-    {
-        let mut file = netcdf::create(&temporary)?;
-        let axes = &["x", "y", "z"][..plan.domain.dimensions];
-        for (k, name) in axes.iter().enumerate() {
-            file.add_dimension(name, grid[k])?;
-        }
-        for (k, name) in axes.iter().enumerate() {
-            let mut variable = file.add_variable::<f64>(name, &[name])?;
-            let step = plan.domain.extent()[k] / (grid[k] - 1) as f64;
-            let values: Vec<f64> = (0..grid[k]).map(|i| plan.domain.min[k] + step * i as f64).collect();
-            variable.put_values(&values, ..)?;
-            let (long_name, units) = axis_words(&slide.velocity, k);
-            variable.put_attribute("long_name", long_name)?;
-            variable.put_attribute("units", units)?;
-        }
-        let dimensions: Vec<&str> = axes.iter().rev().copied().collect();
-        let unit = if plan.time_unit.is_empty() { "1" } else { &plan.time_unit };
-        {
-            let mut variable = file.add_variable::<f64>("ftle", &dimensions)?;
-            variable.set_fill_value(f64::NAN)?;
-            variable.put_values(ftle, ..)?;
-            variable.put_attribute("long_name", "finite-time Lyapunov exponent")?;
-            variable.put_attribute("units", if unit == "1" { unit.to_owned() } else { format!("{unit}-1") })?;
-        }
-        let mut variable = file.add_variable::<f32>("lifetime_share", &dimensions)?;
-        variable.put_values(lifetime_share, ..)?;
-        variable.put_attribute("long_name", "share of tau until the particle stopped")?;
-        variable.put_attribute("units", "1")?;
-        file.add_attribute("title", plan.scene.title.as_str())?;
-        file.add_attribute("source", format!("ridgewatch {} from {}", env!("CARGO_PKG_VERSION"), plan.source))?;
-        file.add_attribute("seed_time", slide.time)?;
-        let counted_from = if unit == "s" && slide.date.is_some() { "s since 1970-01-01" } else { unit };
-        file.add_attribute("seed_time_units", counted_from)?;
-        if let Some(date) = &slide.date {
-            file.add_attribute("seed_date", date.as_str())?;
-        }
-        file.add_attribute("tau", tracer.tau())?;
-        file.add_attribute("tau_units", unit)?;
-        if let Some(difference) = difference_of_steps(tracer) {
-            file.add_attribute("integration_difference", difference)?;
-        }
-        file.add_attribute("direction", plan.map.direction.name())?;
-        file.add_attribute("integrator", format!("{}, {}, {} steps", word(plan.map.integrator), word(plan.map.precision), tracer.steps()))?;
-    }
-    temporary.persist(out)?;
-    Ok(())
-}
-
-/// Name and unit of an axis in its source.
-fn axis_words(velocity: &VelocitySource, axis: usize) -> (&str, &str) {
-    let known = match velocity {
-        VelocitySource::Window(window) => window.grid().and_then(|g| g.axes.get(axis)).map(|a| (a.name(), a.units())),
-        VelocitySource::Analytic(..) => None,
-    };
-    known.unwrap_or((["x", "y", "z"][axis], "1"))
-}
-
 fn print_report(report: &Report) {
     let [nx, ny, nz] = report.grid;
     let when = report.date.clone().unwrap_or_else(|| format!("t0 = {}", report.time));
@@ -401,8 +422,5 @@ fn print_report(report: &Report) {
             let order = if k > 0 { format!("   order {:.2}", c.order[k - 1]) } else { String::new() };
             print_text(format_args!("  {steps:>4} steps   rms {rms:.3e}{order}"));
         }
-    }
-    if let Some(file) = &report.file {
-        print_text(format_args!("written to {}", file.display()));
     }
 }

@@ -9,12 +9,13 @@ use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{
-    DEFAULT_ENDPOINT, FileStatistics, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
+    DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
+    WhenDiskSlow,
 };
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
 use ridgewatch::steer::{CommandSocket, SteerError};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -45,6 +46,16 @@ pub struct RunArguments {
     /// which is printed, holds the key. With --dashboard its page steers, and without ENDPOINT another one is taken if private is in use.
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<String>>,
+    /// Make a film of the frames: NAME.gif, or NAME.mp4 by the program ffmpeg, which must be installed. `replay` refuses a film that exists, unless
+    /// --overwrite is given; `attach` takes the first of NAME, NAME-2, NAME-3 that does not.
+    #[arg(long, value_name = "FILE")]
+    movie: Option<PathBuf>,
+    /// Frames a second of the film, from 1 to 50.
+    #[arg(long, value_name = "N", default_value_t = 10.0, requires = "movie")]
+    movie_fps: f64,
+    /// Write time and stated error into the film.
+    #[arg(long, requires = "movie")]
+    annotate: bool,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
@@ -147,6 +158,7 @@ impl Session<'_> {
         let named = options.steer.iter().flatten().next();
         let listen = |steering| listen(named.map(String::as_str), options.dashboard.is_some(), steering);
         let commands = steering.as_ref().map(listen).transpose()?;
+        let movie = options.movie.as_deref().map(|path| film(path, options, follows, &publish)).transpose()?;
         let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
         if out != options.out {
@@ -157,6 +169,7 @@ impl Session<'_> {
             return Err(error.into());
         }
         output.write_to(folder, &publish)?;
+        movie.into_iter().for_each(|movie| output.film(movie));
         if let Some(endpoint) = output.endpoint() {
             messages::note(format_args!("publishing at {endpoint}"));
         }
@@ -198,6 +211,7 @@ impl Session<'_> {
         }
         if !common.json {
             print_text(format_args!("frames in {}", out.join("frames").display()));
+            summary.movie.iter().for_each(|movie| print_text(movie.line()));
         }
         const DONE: &str = "the run folder is complete up to the last finished frame";
         match (report.interrupted, follows) {
@@ -210,6 +224,28 @@ impl Session<'_> {
             (true, false) => Err(Interrupted { status: stop.status(), done: DONE }.into()),
         }
     }
+}
+
+/// Starts the film of a run. A run that follows a simulation, which may be started again, takes a name that is free.
+fn film(path: &Path, options: &RunArguments, follows: bool, publish: &PublishSettings) -> Result<Movie> {
+    let mut name = path.to_owned();
+    let mut number = 2;
+    while follows && !options.overwrite && name.symlink_metadata().is_ok() {
+        let [stem, extension] = [path.file_stem(), path.extension()].map(|part| part.unwrap_or_default().to_string_lossy().into_owned());
+        name = path.with_file_name(format!("{stem}-{number}.{extension}"));
+        number += 1;
+    }
+    if name != path {
+        messages::note(format_args!("{} exists: the film is written to {}", path.display(), name.display()));
+    }
+    let settings = MovieSettings {
+        path: name,
+        frames_per_second: options.movie_fps,
+        annotate: options.annotate,
+        waits: publish.when_disk_slow.unwrap_or(WhenDiskSlow::Wait) == WhenDiskSlow::Wait,
+        overwrite: options.overwrite,
+    };
+    Ok(Movie::start(settings)?)
 }
 
 /// Starts the output of a run with a dashboard. An endpoint that is wanted for the dashboard alone costs no run: another `ridgewatch` may publish

@@ -3,11 +3,14 @@
 //! In: finished frames. Out: files and messages, described in docs/protocol.md. A slow subscriber or a full disk never stops the cycle, which
 //! calls [`Output`] alone. This room uses `run` and `render` for their types only.
 
+mod annotate;
 mod compare;
 mod error;
+mod export;
 mod exr;
 mod file_writer;
 mod message;
+mod movie;
 mod newest;
 mod output;
 mod preview;
@@ -19,13 +22,15 @@ mod zmq;
 
 pub use compare::{CompareError, Comparison, compare_files, compare_films};
 pub use error::PublishError;
+pub use export::{Field, FieldExport, FieldFormat, FieldFrame};
 pub use exr::{channels_at, decode_exr, encode_exr, read_exr, write_exr};
 pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
+pub use movie::{Movie, MovieSettings};
 pub use newest::{NewestFrame, NoFrame};
 pub use output::Output;
 pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};
 pub use scene::{refuse_foreign_scene, write_scene};
 pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, Peers, PublishSettings, WhenDiskSlow};
-pub use summary::{FileStatistics, PublishStatistics, Summary, Totals, peak_memory_bytes};
+pub use summary::{FileStatistics, MovieStatistics, PublishStatistics, Summary, Totals, peak_memory_bytes};
 pub use zmq::Publisher;

@@ -2,6 +2,7 @@
 
 use super::error::PublishError;
 use super::file_writer::FileWriter;
+use super::movie::Movie;
 use super::newest::NewestFrame;
 use super::run_folder::RunFolder;
 use super::settings::PublishSettings;
@@ -20,6 +21,7 @@ pub struct Output {
     files: Option<FileWriter>,
     publisher: Option<Publisher>,
     newest: Option<Arc<NewestFrame>>,
+    movie: Option<Movie>,
     totals: Totals,
     frames: u64,
     started: Instant,
@@ -34,7 +36,7 @@ impl Output {
         settings.check()?;
         let publisher = settings.endpoint.as_deref().map(|endpoint| Publisher::start(endpoint, settings)).transpose()?;
         let (totals, frames, started) = (Totals::default(), 0, Instant::now());
-        let mut output = Self { files: None, publisher, newest: None, totals, frames, started };
+        let mut output = Self { files: None, publisher, movie: None, newest: None, totals, frames, started };
         folder.map_or(Ok(()), |folder| output.write_to(folder, settings))?;
         Ok(output)
     }
@@ -53,6 +55,11 @@ impl Output {
         self.newest = Some(newest);
     }
 
+    /// Starts to make a film of the frames.
+    pub fn film(&mut self, movie: Movie) {
+        self.movie = Some(movie);
+    }
+
     /// Endpoint of the socket, with the port that was bound. `None` without a socket.
     pub fn endpoint(&self) -> Option<&str> {
         self.publisher.as_ref().map(Publisher::endpoint)
@@ -69,21 +76,26 @@ impl Output {
         if let Some(publisher) = &self.publisher {
             publisher.frame(frame.clone());
         }
+        if let Some(movie) = &mut self.movie {
+            movie.frame(frame.clone());
+        }
         if let Some(files) = &self.files {
             files.frame(frame);
         }
     }
 
-    /// Finishes the files (a minute at most) and the socket (half a second at most), and writes `summary.json` with the caller's values under
+    /// Finishes the film and the files (a minute each at most) and the socket (half a second at most), and writes `summary.json` with the caller's values under
     /// `run`. Returns the summary. If it cannot be written, that is a warning.
     pub fn finish(self, run: serde_json::Map<String, serde_json::Value>) -> Summary {
         let published = self.publisher.map(|publisher| publisher.finish(LINGER));
+        let movie = self.movie.map(Movie::finish);
         let (folder, files) = self.files.map(FileWriter::finish).unzip();
         let summary = Summary {
             frames: self.frames,
             totals: self.totals,
             files,
             published,
+            movie,
             seconds: self.started.elapsed().as_secs_f64(),
             peak_memory_bytes: peak_memory_bytes(),
             run,

@@ -14,6 +14,9 @@ pub struct Summary {
     pub files: Option<FileStatistics>,
     /// Counts of the socket. `None` without one.
     pub published: Option<PublishStatistics>,
+    /// Counts of the film. `None` without one.
+    #[serde(default)]
+    pub movie: Option<MovieStatistics>,
     /// Wall-clock seconds from start to finish.
     pub seconds: f64,
     /// Largest resident memory of the process, in bytes. `None` if the system does not report it.
@@ -123,6 +126,33 @@ pub struct FileStatistics {
     pub unfinished: u64,
     /// Error of the first record or picture that the disk refused.
     pub refused: Option<String>,
+}
+
+/// Counts of the film. `frames = frames_written + frames_lost`, unless the encoder hangs or fails: frames that it held are in neither.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct MovieStatistics {
+    /// The film's file.
+    pub file: String,
+    /// Frames in the film.
+    pub frames_written: u64,
+    /// Frames left out because the encoder was slower than the cycle, or had failed.
+    pub frames_lost: u64,
+    /// Why the film ends early. `None` if it is complete.
+    pub failed: Option<String>,
+}
+
+impl MovieStatistics {
+    /// The film in a line for people.
+    pub fn line(&self) -> String {
+        let Self { file, frames_written, frames_lost, failed } = self;
+        let lost = if *frames_lost > 0 { format!(", {frames_lost} left out") } else { String::new() };
+        let failed = failed.as_ref().map_or_else(String::new, |why| format!("; it ends early: {why}"));
+        if *frames_written == 0 {
+            return format!("no frame for the film {file}{lost}{failed}");
+        }
+        format!("film of {frames_written} frames{lost} in {file}{failed}")
+    }
 }
 
 impl FileStatistics {

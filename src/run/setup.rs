@@ -8,7 +8,7 @@ use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetti
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
-use crate::source::{DEFAULT_READ_AHEAD, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, window_snapshots};
+use crate::source::{DEFAULT_READ_AHEAD, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, window_snapshots};
 use crate::surrogate::Kind;
 use crate::surrogate::network::Input;
 
@@ -25,6 +25,8 @@ pub struct Plan {
     pub source: String,
     /// Unit of times: `s`, `snapshots`, or the simulation's; empty if they have none.
     pub time_unit: String,
+    /// Names and meaning of the domain's coordinates; empty if they are in no file.
+    pub georeference: Georeference,
 }
 
 /// A plan and its opened source.
@@ -178,6 +180,7 @@ impl Setup {
             notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
+        let georeference = snapshots.as_ref().map(|s| s.georeference()).unwrap_or_default();
         if scene.source.kind == SourceKind::Archive
             && let (Some(times), Some(grid)) = (&times, &grid)
         {
@@ -193,7 +196,7 @@ impl Setup {
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
-        Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, slides, notes })
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes })
     }
 }
 

@@ -16,6 +16,7 @@ mod archive_settings;
 mod cf;
 mod error;
 mod formats;
+mod georeference;
 mod grids;
 pub mod live;
 mod snapshots;
@@ -26,8 +27,10 @@ pub use archive::{
     ResolutionReport, Steady, TimeReport, VariableReport, expand, inspect, read_ahead, synthesize,
 };
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
+pub use cf::calendar::utc;
 pub use error::SourceError;
 pub use formats::{FormatError, FormatFault, hdf5_version, netcdf_version, report_crashes};
+pub use georeference::{Coordinate, Georeference, GridMapping, MappingValue, Positions};
 pub use grids::{FileOrder, InFile};
 pub use snapshots::{Listener, SnapshotSource, SourceDescription, StillReading, TimeGap, window_snapshots};
 pub use source_settings::{DomainSettings, SourceKind, SourceSettings};

@@ -2,6 +2,7 @@
 
 use super::archive_settings::Metric;
 use super::error::SourceError;
+use super::georeference::Georeference;
 use ridgewatch_field::{Grid, Snapshot};
 use serde::Serialize;
 use std::sync::Arc;
@@ -31,6 +32,11 @@ pub trait SnapshotSource: Send {
     /// A time as a date (`2002-01-01T00:00:00Z`); `None` without a calendar.
     fn date(&self, _time: f64) -> Option<String> {
         None
+    }
+
+    /// Names and meaning of the coordinates; empty if they are in no file.
+    fn georeference(&self) -> Georeference {
+        Georeference::default()
     }
 
     /// Description for logs and summaries.

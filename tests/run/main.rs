@@ -5,9 +5,11 @@ mod archives;
 mod checkpoints;
 mod command_line;
 mod default_tau;
+mod export;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod messages;
+mod movie;
 #[path = "../network_support/mod.rs"]
 mod network_support;
 mod scene_file;

@@ -11,6 +11,7 @@ use crate::cf::coordinate::Kind;
 use crate::cf::velocity::judge;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
+use crate::georeference::Georeference;
 use crate::grids::read_component;
 use crate::grids::{
     AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, VelocityScale, ZERO, difference, holds_mask, plan,
@@ -61,6 +62,7 @@ pub struct Archive {
     resampling: Option<Resampling>,
     metric: Metric,
     in_cells: bool,
+    georeference: Georeference,
     description: SourceDescription,
     open: Option<(usize, DataFile)>,
     /// Listing of the velocities, if it suffices to open files.
@@ -112,6 +114,7 @@ impl Archive {
         let mut open = None;
         let mut expected: Option<Listing> = None;
         let mut synthetic = None;
+        let mut georeference = Georeference::default();
         let mut masks: Vec<Group> = Vec::new();
         for group in groups {
             let Some(path) = group.first().cloned() else { continue };
@@ -143,6 +146,7 @@ impl Archive {
                         masks.insert(0, group);
                     }
                     format = file.listing.format;
+                    georeference = Georeference::of(&file, &layout, settings);
                     first = Some(layout);
                 }
             }
@@ -201,6 +205,7 @@ impl Archive {
             scale,
             metric: layout.metric,
             in_cells: settings.velocity_unit == VelocityUnit::Cells,
+            georeference,
             description,
             open,
             expected: expected.map(|listing| listing.part(&names)),
@@ -473,6 +478,10 @@ impl SnapshotSource for Archive {
         }
         let (low, high) = (time.floor() as usize, time.ceil() as usize);
         calendar.iso(self.seconds[low] + (self.seconds[high] - self.seconds[low]) * time.fract())
+    }
+
+    fn georeference(&self) -> Georeference {
+        self.georeference.clone()
     }
 
     fn describe(&self) -> SourceDescription {

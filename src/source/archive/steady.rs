@@ -1,6 +1,7 @@
 //! One snapshot as a steady flow.
 
 use crate::error::SourceError;
+use crate::georeference::Georeference;
 use crate::snapshots::{SnapshotSource, SourceDescription};
 use ridgewatch_field::{Grid, Snapshot};
 use std::sync::Arc;
@@ -50,6 +51,10 @@ impl SnapshotSource for Steady {
 
     fn date(&self, time: f64) -> Option<String> {
         self.source.date(time)
+    }
+
+    fn georeference(&self) -> Georeference {
+        self.source.georeference()
     }
 
     fn describe(&self) -> SourceDescription {

@@ -93,6 +93,12 @@ impl Calendar {
     }
 }
 
+/// `2002-01-01T00:00:00Z` for a moment of this machine's clock.
+pub fn utc(moment: std::time::SystemTime) -> String {
+    let seconds = moment.duration_since(std::time::UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
+    Calendar::Proleptic.iso(seconds).unwrap_or_default()
+}
+
 /// Day of a year that begins in March, so that the leap day is its last.
 fn day_from_march(month: i64, day: i64) -> i64 {
     (153 * ((month + 9) % 12) + 2) / 5 + day - 1

@@ -5,9 +5,9 @@ use super::axes::{AxisPlan, Quantity};
 use ridgewatch_field::{Axis, AxisFault};
 
 /// Scale height of the atmosphere, metres.
-const SCALE_HEIGHT: f64 = 7000.0;
+pub const SCALE_HEIGHT: f64 = 7000.0;
 /// Pressure at height 0, Pa.
-const REFERENCE_PRESSURE: f64 = 100_000.0;
+pub const REFERENCE_PRESSURE: f64 = 100_000.0;
 
 /// Turns a level axis into (scaled) heights in metres. Returns also the factor of each level from velocities along the file's axis to
 /// velocities along the new one; for pressures w = -H omega / p.

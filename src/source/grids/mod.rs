@@ -34,7 +34,7 @@ pub use component::{ComponentPlan, Orders, read_component};
 pub use content::{Content, content};
 pub use land::Mask;
 pub use layout::{Layout, Resampling, difference};
-pub use levels::to_heights;
+pub use levels::{REFERENCE_PRESSURE, SCALE_HEIGHT, to_heights};
 pub use mask::{Masks, NO_MASK, ZERO, holds_mask};
 pub use plan::{plan, readable_axes};
 pub use poles::Poles;

@@ -67,6 +67,34 @@ impl Nest {
     }
 }
 
+/// Longitudes and latitudes at all centres, at the first `entries` times of a file: x and y in cells of the first place, and the degrees at each
+/// place, x fastest; NaN where no centre ever is. `None` if the file does not say, or cannot be read.
+pub fn places(file: &DataFile, nest: &Nest, entries: usize) -> Option<([Vec<f64>; 2], Vec<[f64; 2]>)> {
+    let [nx, ny] = nest.cells;
+    let mut seen: Vec<(Shift, Vec<[f64; 2]>)> = Vec::new();
+    for entry in 0..entries {
+        let shift = nest.shift(file, entry).ok()?;
+        if seen.iter().all(|(known, _)| *known != shift) {
+            seen.push((shift, points(file, coordinates(file, nest.cells)?, entry, [0, 0], nest.cells).ok()?));
+        }
+    }
+    let [least, greatest] = [isize::min as fn(isize, isize) -> isize, isize::max].map(|f| {
+        let of = |k: usize| seen.iter().map(|(shift, _)| shift[k]).reduce(f);
+        Some([of(0)?, of(1)?])
+    });
+    let (least, greatest) = (least?, greatest?);
+    let [width, height] = [0, 1].map(|k| nest.cells[k] + (greatest[k] - least[k]) as usize);
+    let mut degrees = vec![[f64::NAN; 2]; width * height];
+    for (shift, centres) in &seen {
+        let [i0, j0] = [0, 1].map(|k| (shift[k] - least[k]) as usize);
+        for j in 0..ny {
+            degrees[(j0 + j) * width + i0..][..nx].copy_from_slice(&centres[j * nx..][..nx]);
+        }
+    }
+    let along = |k: usize, n: usize| (0..n).map(|a| (least[k] + a as isize) as f64).collect();
+    Some(([along(0, width), along(1, height)], degrees))
+}
+
 /// The variables of longitude and latitude, on (y, x) or (time, y, x).
 fn coordinates(file: &DataFile, [nx, ny]: [usize; 2]) -> Option<[usize; 2]> {
     let find = |name| {

@@ -9,7 +9,7 @@
 
 use super::axes::{AxisPlan, Quantity};
 use super::component::{ComponentPlan, SquaredErrors, read_component};
-use super::nest::{Nest, Shift};
+use super::nest::{Nest, Shift, places};
 use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
 use crate::formats::DataFile;
@@ -225,6 +225,13 @@ impl Staggered {
             Ok(AxisPlan::made(kind, axis, Quantity::Length))
         };
         Ok([plan(0, "west_east", Kind::X)?, plan(1, "south_north", Kind::Y)?])
+    }
+
+    /// Longitudes and latitudes at the centres of all places of the grid in the first `entries` times of a file: x, y and the degrees, x fastest.
+    pub fn positions(&self, file: &DataFile, entries: usize) -> Option<(Vec<f64>, Vec<f64>, Vec<[f64; 2]>)> {
+        let ([x, y], degrees) = places(file, self.nest.as_ref()?, entries)?;
+        let metres = |k: usize, cells: Vec<f64>| cells.into_iter().map(|a| (a + 0.5) * self.step[k]).collect();
+        Some((metres(0, x), metres(1, y), degrees))
     }
 
     /// See [`super::layout::Resampling::error`].
