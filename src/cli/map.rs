@@ -229,7 +229,7 @@ fn explained(scene: &SceneFile, error: MapError) -> anyhow::Error {
         MapError::Run(error) => located(scene, error, RunError::refused),
         MapError::Both { tau, error } => located(scene, error, RunError::refused)
             .context(format!("--both needs data over twice tau (tau = {tau}); accepted: a shorter --tau")),
-        MapError::Draw(error) => anyhow!(error),
+        error @ (MapError::AllMissing(_) | MapError::Draw(_)) => anyhow!(error),
     }
 }
 

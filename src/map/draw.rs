@@ -5,6 +5,7 @@
 
 use super::colour::Ramp;
 use super::graticule::{GridLine, axis_unit, graticule};
+use super::projection::Projection;
 use super::view::View;
 use super::words::{duration, even_step, number, ticks};
 use base64::Engine as _;
@@ -115,7 +116,9 @@ impl Layout {
         let width = (left + inner + right).max(if figure.bars.len() > 1 { 820.0 } else { 640.0 } * unit).ceil();
         let start = left + (width - right - left - inner) / 2.0;
         let row = caption + h + 30.0 * unit + axis;
-        let top = 66.0 * unit;
+        // Meridians that end at the top have their labels there.
+        let is_round = matches!(figure.view.projection, Projection::Polar { .. });
+        let top = if is_round { 88.0 } else { 66.0 } * unit;
         let panels = (0..figure.panels.len())
             .map(|k| [(start + (k % columns) as f64 * (w + between)).round(), (top + caption + (k / columns) as f64 * row).round()])
             .collect();
@@ -317,9 +320,11 @@ impl<B: DrawingBackend> Pen<'_, B> {
         for line in &panel.contours {
             self.line(line, corner, WHITE.mix(0.9), 1.2 * u)?;
         }
+        // By the size of the panel, so that lines leave room between them.
+        let thin = (1.3 * w.max(h) / 900.0).max(0.8);
         for (colour, line) in &panel.ridges {
             let [r, g, b] = *colour;
-            self.line(line, corner, RGBColor(r, g, b).to_rgba(), 1.3 * u)?;
+            self.line(line, corner, RGBColor(r, g, b).to_rgba(), thin)?;
         }
         for (colour, width) in [(BLACK.mix(0.55), 2.6), (WHITE.to_rgba(), 1.1)] {
             for [tail, tip] in &panel.arrows {
@@ -329,11 +334,13 @@ impl<B: DrawingBackend> Pen<'_, B> {
                 self.line(&[barb(1.0), *tip, barb(-1.0)], corner, colour, width * u)?;
             }
         }
-        self.line(&view.rim(), corner, BLACK.to_rgba(), 1.2 * u)?;
+        view.rim().iter().try_for_each(|line| self.line(line, corner, BLACK.to_rgba(), 1.2 * u))?;
         if let (Some(names), Some(units)) = (&figure.axes, units) {
             let words = |k: usize| if units[k].0.is_empty() { names[k].0.clone() } else { format!("{}, {}", names[k].0, units[k].0) };
             self.text(&words(0), [corner[0] + w / 2.0, corner[1] + h + 25.0 * u], 14.0 * u, CENTRE, FontTransform::None)?;
-            self.text(&words(1), [corner[0] - 76.0 * u, corner[1] + h / 2.0], 14.0 * u, CENTRE, FontTransform::Rotate270)?;
+            let widths = grid[1].iter().map(|line| self.width(&line.label, 14.0 * u));
+            let widest = widths.collect::<Result<Vec<f64>, _>>()?.into_iter().fold(0.0, f64::max);
+            self.text(&words(1), [corner[0] - 32.0 * u - widest, corner[1] + h / 2.0], 14.0 * u, CENTRE, FontTransform::Rotate270)?;
         }
         Ok(())
     }

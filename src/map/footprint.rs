@@ -103,22 +103,32 @@ pub struct RasterError {
     pub pixels: usize,
 }
 
-impl RasterError {
-    /// From the means a and b of two independent, unbiased halves of each pixel: the mean (a + b) / 2 has the variance E[(a - b)^2] / 4.
-    pub fn of_halves(halves: impl Iterator<Item = [f64; 2]>) -> Option<Self> {
-        let (mut count, mut sum, mut square) = (0usize, 0.0, 0.0);
-        for [a, b] in halves {
-            let variance = (a - b).powi(2) / 4.0;
-            (count, sum, square) = (count + 1, sum + variance, square + variance * variance);
-        }
-        if count < 2 {
+/// Sums over the variances of pixels.
+#[derive(Default)]
+struct Variances {
+    count: usize,
+    sum: f64,
+    square: f64,
+}
+
+impl Variances {
+    /// Adds a pixel by the means a and b of its two independent, unbiased halves: the mean (a + b) / 2 has the variance E[(a - b)^2] / 4.
+    fn add(&mut self, [a, b]: [f64; 2]) {
+        let variance = (a - b).powi(2) / 4.0;
+        self.count += 1;
+        self.sum += variance;
+        self.square += variance * variance;
+    }
+
+    fn error(&self) -> Option<RasterError> {
+        if self.count < 2 {
             return None;
         }
-        let mean = sum / count as f64;
+        let mean = self.sum / self.count as f64;
         // Of the mean of the variances, by the central limit theorem.
-        let deviation = ((square / count as f64 - mean * mean).max(0.0) / (count - 1) as f64).sqrt();
+        let deviation = ((self.square / self.count as f64 - mean * mean).max(0.0) / (self.count - 1) as f64).sqrt();
         let interval = [mean - 1.96 * deviation, mean + 1.96 * deviation].map(|v| v.max(0.0).sqrt());
-        Some(Self { rms: mean.sqrt(), interval, pixels: count })
+        Some(RasterError { rms: mean.sqrt(), interval, pixels: self.count })
     }
 }
 
@@ -148,15 +158,16 @@ impl Raster {
     pub fn trace(view: &View, tracer: &mut MapTracer<'_>, sampling: Sampling, done: &mut dyn FnMut(usize)) -> Result<Self, BackendError> {
         let count = view.size[0] * view.size[1];
         let mut raster = Self { size: view.size, mean: vec![f32::NAN; count], missing: vec![f32::NAN; count], error: None, failed: 0 };
-        let mut halves: Vec<[f64; 2]> = Vec::with_capacity(count);
-        let pixels: Vec<usize> = (0..count).collect();
-        for part in pixels.chunks((AT_ONCE / sampling.seeds).max(1)) {
-            let seeds: Vec<Vec<(usize, DomainPoint)>> = part.par_iter().map(|&pixel| seeds_of(view, sampling, pixel)).collect();
+        let mut variances = Variances::default();
+        let at_once = (AT_ONCE / sampling.seeds).max(1);
+        for first in (0..count).step_by(at_once) {
+            let part = first..(first + at_once).min(count);
+            let seeds: Vec<Vec<(usize, DomainPoint)>> = part.clone().into_par_iter().map(|pixel| seeds_of(view, sampling, pixel)).collect();
             let flat: Vec<DomainPoint> = seeds.iter().flatten().map(|(_, seed)| *seed).collect();
             let values = tracer.ftle(&flat, &mut |_| ())?;
             let flow = tracer.flow();
             let mut next = 0;
-            for (&pixel, seeds) in part.iter().zip(&seeds) {
+            for (pixel, seeds) in part.clone().zip(&seeds) {
                 let (mut sum, mut number, mut missing) = ([0.0; 2], [0usize; 2], 0usize);
                 for (half, seed) in seeds {
                     let value = values[next];
@@ -178,12 +189,12 @@ impl Raster {
                     raster.mean[pixel] = ((sum[0] + sum[1]) / all as f64) as f32;
                 }
                 if number[0] > 0 && number[1] > 0 {
-                    halves.push([sum[0] / number[0] as f64, sum[1] / number[1] as f64]);
+                    variances.add([sum[0] / number[0] as f64, sum[1] / number[1] as f64]);
                 }
             }
             done(part.len());
         }
-        raster.error = RasterError::of_halves(halves.into_iter());
+        raster.error = variances.error();
         Ok(raster)
     }
 

@@ -16,7 +16,7 @@ pub struct GridLine {
 /// Steps of degrees that are in use on maps.
 const DEGREES: [f64; 12] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0];
 /// Pixels between two lines, at least.
-const APART: f64 = 90.0;
+const APART: f64 = 70.0;
 /// Points of a line.
 const POINTS: usize = 120;
 
@@ -72,9 +72,9 @@ pub fn graticule(view: &View, divisors: [f64; 2], scale: f64) -> [Vec<GridLine>;
         } else {
             even_step(high - low, (count / 2.0).max(2.0))
         };
-        // The line at which a full circle closes is drawn once.
-        let shown =
-            ticks([low, high], step).into_iter().filter(|v| !(view.is_geographic && axis == 0 && v - low >= 360.0 && polar.is_some()));
+        // On a polar map, the line at which a full circle closes is drawn once, and the pole is no line.
+        let is_drawn = |v: &f64| polar.is_none() || if axis == 0 { v - low < 360.0 } else { v.abs() < 90.0 };
+        let shown = ticks([low, high], step).into_iter().filter(is_drawn);
         let line = |value: f64| {
             let label = match (view.is_geographic, axis) {
                 (true, 0) => longitude(value),

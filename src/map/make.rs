@@ -15,8 +15,9 @@ use super::{MapError, Moment};
 use crate::backend::Device;
 use crate::field::EARTH_RADIUS;
 use crate::flow::{Direction, FlowMap, VelocitySource};
-use crate::run::RunError;
+use crate::run::{Plan, RunError};
 use serde::Serialize;
+use std::path::Path;
 
 /// What a map shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -190,9 +191,7 @@ pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &m
         }
     }
     if traced.iter().all(|t| t.raster.mean.iter().all(|v| v.is_nan())) {
-        return Err(MapError::Usage(
-            "no pixel has a velocity: all seeds lie on missing cells (fill values or NaN; `ridgewatch inspect` counts them)".into(),
-        ));
+        return Err(MapError::AllMissing(when(moment)));
     }
     let values: Vec<&[f32]> = traced.iter().map(|t| &t.raster.mean[..]).collect();
     let shown = options.range.unwrap_or_else(|| range(&values, options.both).map(|v| v * rate.factor));
@@ -290,6 +289,21 @@ fn axes(velocity: &VelocitySource) -> [(String, String); 2] {
     })
 }
 
+/// Title of the scene, else its files.
+fn name(plan: &Plan) -> String {
+    let files = &plan.scene.archive.files;
+    if !plan.scene.title.is_empty() {
+        return plan.scene.title.clone();
+    }
+    let Some(first) = files.first() else { return String::new() };
+    // A pattern without a name of its own is called by its folder.
+    let stem = |path: &Path| {
+        path.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().trim_matches(['*', '_', '-', '.']).to_owned())
+    };
+    let name = Some(stem(first)).filter(|name| !name.is_empty()).unwrap_or_else(|| first.parent().map_or_else(String::new, stem));
+    if files.len() > 1 { format!("{name} and further files") } else { name }
+}
+
 /// Seed time in words.
 fn when(moment: &Moment) -> String {
     let unit = &moment.plan.time_unit;
@@ -373,7 +387,8 @@ fn figure(
             VelocitySource::Analytic(..) => ("z".into(), String::new()),
         };
         let (unit, divisor) = axis_unit(&unit, view.level.abs());
-        format!(", {name} = {} {unit}", number(view.level / divisor)).trim_end().to_owned()
+        let value = number(view.level / divisor);
+        format!(", level {value} {unit} ({name})").replace("  ", " ")
     } else {
         String::new()
     };
@@ -390,24 +405,22 @@ fn figure(
     } else {
         format!(", error {} rms ({} % of the colours)", rate.words(largest), number(100.0 * largest / (shown[1] - shown[0])))
     };
-    footer.push(format!("Pixels: mean of {} seeds{error}. Projection: {}.", options.sampling.seeds, view.projection.words()));
+    let colours: Vec<&str> = traced[..per_panel].iter().map(|t| ramp(options.both, t.direction).name()).collect();
+    footer.push(format!("Pixels: mean of {} seeds{error}. Colours: {}.", options.sampling.seeds, colours.join(", ")));
     let speed = found.map(|arrows| {
-        let unit = match &moment.velocity {
-            VelocitySource::Window(_) if view.is_geographic && plan.time_unit == "s" => " m/s",
-            _ => "",
-        };
+        // Velocities on the sphere are metres, others are in the unit of the axes.
+        let length = if view.is_geographic { "m" } else { names[0].1.as_str() };
+        let unit = if length.is_empty() || plan.time_unit.is_empty() { String::new() } else { format!(" {length}/{}", plan.time_unit) };
         format!("Longest arrow: {}{unit}.", number(arrows.fastest))
     });
     let contours = (!options.contours.is_empty())
         .then(|| format!("Lines: {}.", options.contours.iter().map(|c| rate.words(*c)).collect::<Vec<_>>().join(", ")));
     let ridges = options.ridges.map(|_| format!("Ridge lines: {}.", traced.iter().map(|t| t.ridges.len()).sum::<usize>()));
     let missing = traced.iter().any(|t| t.raster.missing.iter().any(|m| *m >= 0.5)).then(|| "Grey: land or missing.".to_owned());
-    let last: Vec<String> = [missing, ridges, contours, speed].into_iter().flatten().collect();
-    if !last.is_empty() {
-        footer.push(last.join(" "));
-    }
+    let projection = Some(format!("Projection: {}.", view.projection.words()));
+    footer.push([projection, missing, ridges, contours, speed].into_iter().flatten().collect::<Vec<_>>().join(" "));
     MapFigure {
-        title: format!("{what}: {}", plan.scene.title).trim_end_matches([':', ' ']).to_owned(),
+        title: format!("{what}: {}", name(plan)).trim_end_matches([':', ' ']).to_owned(),
         subtitle: format!("{}{tau}{level}", when(moment)),
         footer,
         axes: if view.is_geographic { None } else { Some(names) },

@@ -46,6 +46,9 @@ pub enum MapError {
     /// The scene, its source or the device fails.
     #[error(transparent)]
     Run(#[from] RunError),
+    /// No pixel has a velocity.
+    #[error("no pixel has a velocity at {0}: all seeds lie on missing cells (fill values or NaN; `ridgewatch inspect` counts them)")]
+    AllMissing(String),
     /// The source is too short for both directions.
     #[error("both directions from one time need twice tau = {tau} of data: {error}")]
     Both {

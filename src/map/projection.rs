@@ -131,7 +131,7 @@ impl Projection {
     pub fn words(&self) -> String {
         match *self {
             Self::PlateCarree { cosine: 1.0 } => "plate carrée".into(),
-            Self::PlateCarree { cosine } => format!("plate carrée, x times cos {:.1}°", cosine.acos().to_degrees()),
+            Self::PlateCarree { cosine } => format!("plate carrée, shortened east-west by cos {:.1}°", cosine.acos().to_degrees()),
             Self::Mercator => "Mercator".into(),
             Self::Lambert { middle, .. } => format!("Lambert conformal conic about {middle:.1}°"),
             Self::Polar { middle, .. } => format!("polar stereographic about {middle:.1}°"),

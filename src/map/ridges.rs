@@ -1,8 +1,9 @@
 //! Height ridges of a field in the plane: points at which the field is largest across the ridge (Eberly, Ridges in image and data analysis, 1996;
 //! for the FTLE Shadden, Lekien and Marsden, Definition and properties of Lagrangian coherent structures, Physica D 212, 2005).
 //!
-//! With g the gradient, H the Hessian and e its unit eigenvector of the smaller eigenvalue: g . e = 0, and that eigenvalue is negative. Cells are
-//! cut into triangles whose corners agree on the sign of e (Furst and Pizer, Marching ridges, 2001).
+//! With g the gradient, H the Hessian and e its unit eigenvector of the smaller eigenvalue: g . e = 0, and that eigenvalue is negative and the larger
+//! one by magnitude (Lindeberg, Edge detection and ridge detection with automatic scale selection, 1998). Cells are cut into triangles whose corners agree on the
+//! sign of e (Furst and Pizer, Marching ridges, 2001).
 
 use super::contour::{Edge, Segments};
 use rayon::prelude::*;
@@ -25,7 +26,7 @@ pub struct Field {
 /// What counts as a ridge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Strength {
-    /// Percentile of the field, 0 to 100, that the mean over a line reaches.
+    /// Percentile of the field, 0 to 100, that the mean over a line reaches. Points below three quarters of it belong to no line.
     pub percentile: f64,
     /// Least length of a line, in nodes.
     pub length: f64,
@@ -59,6 +60,8 @@ struct Shape {
     slope: f64,
     /// The smaller eigenvalue.
     curvature: f64,
+    /// Sum of both.
+    trace: f64,
 }
 
 impl Field {
@@ -70,14 +73,15 @@ impl Field {
             return Vec::new();
         }
         known.par_sort_unstable_by(f64::total_cmp);
-        let (largest, least) = (known[known.len() - 1].abs().max(known[0].abs()), percentile(&known, strength.percentile));
+        let largest = known[known.len() - 1].abs().max(known[0].abs());
+        let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
         let shapes: Vec<Option<Shape>> = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, largest)).collect();
         let [nx, ny] = self.size;
         let mut segments = Segments::new();
         for j in 0..ny.saturating_sub(1) {
             for i in 0..nx.saturating_sub(1) {
                 for triangle in [[[i, j], [i + 1, j], [i, j + 1]], [[i + 1, j], [i, j + 1], [i + 1, j + 1]]] {
-                    self.cut(triangle, &shapes, &smooth, &mut segments);
+                    self.cut(triangle, &shapes, &smooth, faint, &mut segments);
                 }
             }
         }
@@ -157,11 +161,11 @@ impl Field {
             return None;
         }
         let across = longer.map(|c| c / length);
-        Some(Shape { across, slope: gradient[0] * across[0] + gradient[1] * across[1], curvature })
+        Some(Shape { across, slope: gradient[0] * across[0] + gradient[1] * across[1], curvature, trace: xx + yy })
     }
 
     /// Adds the segment of a triangle of nodes, whose ends are the crossings of two of its sides.
-    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &[Option<Shape>], smooth: &[f64], segments: &mut Segments<RidgePoint>) {
+    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &[Option<Shape>], smooth: &[f64], faint: f64, segments: &mut Segments<RidgePoint>) {
         let nx = self.size[0];
         let at = |[i, j]: [usize; 2]| shapes[j * nx + i];
         let [Some(a), Some(b), Some(c)] = triangle.map(at) else { return };
@@ -170,7 +174,9 @@ impl Field {
             return;
         }
         let mut ends = [(0, 1), (1, 2), (0, 2)].into_iter().filter_map(|(p, q)| self.crossing(triangle[p], triangle[q], shapes, smooth));
-        if let (Some(first), Some(second)) = (ends.next(), ends.next()) {
+        if let (Some(first), Some(second)) = (ends.next(), ends.next())
+            && first.1.value.min(second.1.value) >= faint
+        {
             segments.add([first, second]);
         }
     }
@@ -196,6 +202,9 @@ impl Field {
             _ => low / (low - high),
         };
         let between = |a: f64, b: f64| a + t * (b - a);
+        if between(a.trace, b.trace) > 0.0 {
+            return None;
+        }
         let place = [0, 1].map(|k| self.origin[k] + self.step[k] * between(from[k] as f64, to[k] as f64));
         let point = RidgePoint { place, value: between(smooth[first], smooth[second]), sharpness: -between(a.curvature, b.curvature) };
         // Along x, along y, and the diagonal.

@@ -96,9 +96,16 @@ impl View {
         DomainPoint([x as f32, y as f32, self.level as f32])
     }
 
-    /// The rim of the data, as a closed line in pixels.
-    pub fn rim(&self) -> Vec<[f64; 2]> {
-        outline(self.region).into_iter().map(|place| self.pixel(place)).collect()
+    /// The rim of the data, in pixels: a closed line, or circles of latitude where a polar map closes.
+    pub fn rim(&self) -> Vec<Vec<[f64; 2]>> {
+        let lines = |places: &[[f64; 2]]| places.iter().map(|place| self.pixel(*place)).collect();
+        let whole = outline(self.region);
+        let [west, south, east, north] = self.region;
+        if matches!(self.projection, Projection::Polar { .. }) && east - west > 360.0 - 1e-6 {
+            let circle = |latitude: f64| lines(&whole.iter().map(|[x, _]| [*x, latitude]).collect::<Vec<_>>());
+            return [south, north].into_iter().filter(|latitude| latitude.abs() < 90.0).map(circle).collect();
+        }
+        vec![lines(&whole)]
     }
 }
 

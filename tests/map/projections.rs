@@ -47,7 +47,10 @@ fn conformal_ones_keep_angles() {
             };
             let (east, north) = (difference([small / y.to_radians().cos(), 0.0]), difference([0.0, small]));
             let scale = east[0].hypot(east[1]);
-            assert!((north[0] - -east[1]).abs() < 1e-5 * scale && (north[1] - east[0]).abs() < 1e-5 * scale, "{kind:?} at {x}, {y}: {east:?} {north:?}");
+            assert!(
+                (north[0] - -east[1]).abs() < 1e-5 * scale && (north[1] - east[0]).abs() < 1e-5 * scale,
+                "{kind:?} at {x}, {y}: {east:?} {north:?}"
+            );
         }
     }
     // Known values: Snyder's numerical example of Mercator's isometric latitude at 35 degrees, and stereographic distance 2 tan of half the colatitude.

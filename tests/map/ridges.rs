@@ -2,7 +2,7 @@
 
 use crate::kit::flow::{stretches, trace};
 use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, Window, analytic::Analytic};
-use ridgewatch::flow::{Extras, FlowMap, Interpolation, Precision, VelocitySource};
+use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, VelocitySource};
 use ridgewatch::map::{Field, RidgePoint, Strength};
 use std::f64::consts::TAU as TURN;
 use std::sync::Arc;
@@ -34,7 +34,8 @@ fn the_saddle_is_exact_to_a_hundredth_of_a_cell() {
         let lines = field.ridges(&ALL);
         assert_eq!(lines.len(), 1, "{angle}: one ridge, in one piece");
         let worst = lines[0].iter().map(|p| across(p.place[0], p.place[1]).abs()).fold(0.0, f64::max) / step;
-        let length = (lines[0][0].place[0] - lines[0][lines[0].len() - 1].place[0]).hypot(lines[0][0].place[1] - lines[0][lines[0].len() - 1].place[1]);
+        let length = (lines[0][0].place[0] - lines[0][lines[0].len() - 1].place[0])
+            .hypot(lines[0][0].place[1] - lines[0][lines[0].len() - 1].place[1]);
         println!("angle {angle:.2}, shift {shift}: worst {worst:.1e} cells, {} points", lines[0].len());
         assert!(worst < 0.01 && length > 1.7, "{angle} {shift}: {worst} cells, length {length}");
         // The largest FTLE is that of the fixed point: its rate.
@@ -54,7 +55,8 @@ fn the_saddle_of_a_traced_grid_is_exact_to_a_hundredth_of_a_cell() {
     for time in [0.0, 1.0] {
         window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &v, &[]))).unwrap();
     }
-    let map = FlowMap { precision: Precision::F64, interpolation: Interpolation::Cubic, ..FlowMap::tangent(1.0, 100) };
+    let map =
+        FlowMap { precision: Precision::F64, boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, ..FlowMap::tangent(1.0, 100) };
     // Nodes beside those of the data.
     let (origin, step, size) = ([-0.4037, -0.4011], 0.0257, [32, 32]);
     let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
@@ -132,8 +134,9 @@ fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
     let ridges = |n: usize| {
         let size = [2 * n + 1, n + 1];
         let step = 1.0 / n as f64;
-        let seeds: Vec<DomainPoint> =
-            (0..size[0] * size[1]).map(|k| DomainPoint([(step * (k % size[0]) as f64) as f32, (step * (k / size[0]) as f64) as f32, 0.5])).collect();
+        let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
+            .map(|k| DomainPoint([(step * (k % size[0]) as f64) as f32, (step * (k / size[0]) as f64) as f32, 0.5]))
+            .collect();
         let values = stretches(&trace(&velocity, &map, 0.0, &seeds, Extras::default())).iter().map(|s| (s / 10.0) as f32).collect();
         let strength = Strength { percentile: 80.0, length: 0.1 * n as f64, smoothing: 0.0 };
         Field { origin: [0.0; 2], step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] }.ridges(&strength)
@@ -143,6 +146,13 @@ fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
         coarse.iter().flatten().map(|p| fine.iter().map(|line| distance(p.place, line)).fold(f64::INFINITY, f64::min) * 100.0).collect();
     distances.sort_by(f64::total_cmp);
     let at = |share: f64| distances[((distances.len() - 1) as f64 * share) as usize];
-    println!("{} lines, {} points: median {:.4}, 90 % {:.3}, 95 % {:.3} coarse cells", coarse.len(), distances.len(), at(0.5), at(0.9), at(0.95));
+    println!(
+        "{} lines, {} points: median {:.4}, 90 % {:.3}, 95 % {:.3} coarse cells",
+        coarse.len(),
+        distances.len(),
+        at(0.5),
+        at(0.9),
+        at(0.95)
+    );
     assert!(coarse.len() >= 3 && distances.len() > 300 && at(0.5) < 0.05, "median {}", at(0.5));
 }
