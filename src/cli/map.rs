@@ -7,8 +7,8 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::files::write_whole;
 use ridgewatch::flow::Direction;
 use ridgewatch::map::{
-    self, LARGEST, LinesAbout, LinesFormat, MapError, MapOptions, MapRecord, Moment, PanelRecord, ProjectionKind, Rate, RidgeLine,
-    Sampling, Strength,
+    self, LARGEST, LinesAbout, LinesFormat, MOST_NODES, MapError, MapOptions, MapRecord, Moment, PanelRecord, ProjectionKind, Rate,
+    RidgeLine, Sampling, Strength,
 };
 use ridgewatch::run::{RunError, TimeSpan};
 use ridgewatch::source::SourceKind;
@@ -72,7 +72,7 @@ pub struct Options {
     /// Standard deviation of the smoothing before derivatives, in nodes of the ridge grid; 0 for none.
     #[arg(long, value_name = "NODES", default_value_t = Strength::default().smoothing, value_parser = smoothing)]
     ridge_smoothing: f64,
-    /// Grid on which ridges are found, NXxNY. Default: about one node per pixel.
+    /// Grid on which ridges are found, NXxNY. Default: two nodes per pixel along x and y.
     #[arg(long, value_name = "NXxNY", value_parser = grid)]
     ridge_grid: Option<[usize; 2]>,
 }
@@ -124,9 +124,12 @@ fn seeds(text: &str) -> Result<usize, String> {
 }
 
 fn grid(text: &str) -> Result<[usize; 2], String> {
-    match dimensions(text).filter(|numbers| numbers.iter().all(|n| (8..=8192).contains(n))).as_deref() {
+    match dimensions(text)
+        .filter(|numbers| numbers.iter().all(|n| (8..=16_384).contains(n)) && numbers.iter().product::<usize>() <= MOST_NODES)
+        .as_deref()
+    {
         Some(&[x, y]) => Ok([x, y]),
-        _ => Err("accepted: NXxNY with numbers from 8 to 8192".into()),
+        _ => Err("accepted: NXxNY with numbers from 8 to 16384, and 2^24 nodes in all".into()),
     }
 }
 

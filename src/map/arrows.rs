@@ -3,6 +3,7 @@
 use super::view::View;
 use crate::field::{Axis, Geometry, Grid};
 use crate::flow::VelocitySource;
+use std::collections::HashSet;
 use std::sync::Arc;
 
 /// Arrows in pixels, and the speed of the longest.
@@ -63,7 +64,9 @@ pub fn arrows(view: &View, velocity: &VelocitySource, time: f64, apart: f64) -> 
     }
     let speed = |v: &[f64; 2]| v[0].hypot(v[1]);
     let fastest = found.iter().map(|(_, v)| speed(v)).fold(0.0, f64::max);
-    let arrow = |(place, v): &([f64; 2], [f64; 2])| {
+    // Nodes crowd near poles.
+    let mut taken = HashSet::new();
+    let mut arrow = |(place, v): &([f64; 2], [f64; 2])| {
         let share = speed(v) / fastest;
         if share.is_nan() || share < 0.02 {
             return None;
@@ -76,8 +79,10 @@ pub fn arrows(view: &View, velocity: &VelocitySource, time: f64, apart: f64) -> 
         // The square root keeps slow ones visible.
         let length = 1.3 * apart * share.sqrt() / dx.hypot(dy);
         let tip = [tail[0] + length * dx, tail[1] + length * dy];
-        let inside = (0..2).all(|k| [tail[k], tip[k]].iter().all(|p| *p >= 0.0 && *p <= view.size[k] as f64));
-        (inside && length.is_finite()).then_some([tail, tip])
+        let inside = length.is_finite() && [tail, tip].iter().all(|[x, y]| view.place(*x, *y).is_some());
+        let cell = tail.map(|c| (c / (0.6 * apart)) as i64);
+        (inside && taken.insert(cell)).then_some([tail, tip])
     };
-    Arrows { arrows: found.iter().filter_map(arrow).collect(), fastest, time: snapshot.time }
+    let arrows = found.iter().filter_map(&mut arrow).collect();
+    Arrows { arrows, fastest, time: snapshot.time }
 }

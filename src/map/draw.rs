@@ -9,12 +9,12 @@ use super::projection::Projection;
 use super::view::View;
 use super::words::{duration, even_step, number, ticks};
 use base64::Engine as _;
-use image::{ImageFormat, RgbImage};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder as _};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use plotters::style::{FontStyle, register_font};
-use std::io::Cursor;
 use thiserror::Error;
 
 /// Font that is built in, so that a map looks the same on every machine.
@@ -163,10 +163,10 @@ pub fn write_png(figure: &MapFigure) -> Result<Vec<u8>, DrawError> {
         let count = (scale * scale) as u32;
         *value = ((block.sum::<u32>() + count / 2) / count) as u8;
     }
-    png(width, height, pixels)
+    png(width, height, &pixels)
 }
 
-fn png(width: usize, height: usize, pixels: Vec<u8>) -> Result<Vec<u8>, DrawError> {
+fn png(width: usize, height: usize, pixels: &[u8]) -> Result<Vec<u8>, DrawError> {
     let picture = RgbImage::from_raw(width as u32, height as u32, pixels)
         .ok_or_else(|| plot_error("the picture has another size than its buffer"))?;
     let mut bytes = Cursor::new(Vec::new());
@@ -197,7 +197,7 @@ pub fn write_svg(figure: &MapFigure) -> Result<String, DrawError> {
         height * FINER
     );
     for (panel, [x, y]) in figure.panels.iter().zip(&layout.panels) {
-        let picture = png(columns, rows, panel.pixels.concat())?;
+        let picture = png(columns, rows, &panel.pixels.concat())?;
         let data = base64::engine::general_purpose::STANDARD.encode(picture);
         whole += &format!(
             "<image x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\" style=\"image-rendering: pixelated\" href=\"data:image/png;base64,{data}\"/>\n",
@@ -390,8 +390,8 @@ impl<B: DrawingBackend> Pen<'_, B> {
         let solid = |[r, g, b]: [u8; 3]| RGBColor(r, g, b).filled();
         const PARTS: usize = 256;
         for part in 0..PARTS {
-            let at = |k: usize| x + width * k as f64 / PARTS as f64;
-            let ends = [self.at([at(part), top]), self.at([at(part + 1), bottom])];
+            // To the end of the bar, and the next one over it: in an SVG, seams between neighbours would show.
+            let ends = [self.at([x + width * part as f64 / PARTS as f64, top]), self.at([x + width, bottom])];
             self.area.draw(&Rectangle::new(ends, solid(bar.ramp.colour((part as f64 + 0.5) / PARTS as f64)))).map_err(plot_error)?;
         }
         // Points at ends beyond which values lie.

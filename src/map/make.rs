@@ -19,6 +19,9 @@ use crate::run::{Plan, RunError};
 use serde::Serialize;
 use std::path::Path;
 
+/// Most nodes of the grid on which ridges are found: some GiB of memory.
+pub const MOST_NODES: usize = 1 << 24;
+
 /// What a map shows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapOptions {
@@ -40,7 +43,7 @@ pub struct MapOptions {
     pub arrows: bool,
     /// Ridge lines; `None`: none.
     pub ridges: Option<Strength>,
-    /// Nodes of the grid on which ridges are found; `None`: about one per pixel.
+    /// Nodes of the grid on which ridges are found; `None`: two per pixel along x and y.
     pub ridge_grid: Option<[usize; 2]>,
 }
 
@@ -248,13 +251,14 @@ fn level(given: Option<f64>, domain: &crate::field::Domain) -> Result<f64, MapEr
     }
 }
 
-/// Nodes at about the distance of pixels.
+/// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes [`MOST_NODES`].
 fn ridge_nodes(view: &View) -> [usize; 2] {
     let [west, south, east, north] = view.region;
     let shrink = if view.is_geographic { ((south + north) / 2.0).to_radians().cos().max(0.1) } else { 1.0 };
     let ratio = (east - west) * shrink / (north - south);
-    let across = ((view.size[0] * view.size[1]) as f64 * ratio).sqrt();
-    [across, across / ratio].map(|n| (n.round() as usize + 1).clamp(8, 16_384))
+    let nodes = (4 * view.size[0] * view.size[1]).min(MOST_NODES / 2);
+    let across = (nodes as f64 * ratio).sqrt();
+    [across, across / ratio].map(|n| (n.round() as usize + 1).max(8))
 }
 
 /// The FTLE at nodes from edge to edge of the data.

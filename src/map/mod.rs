@@ -27,7 +27,7 @@ pub use draw::{DrawError, MapFigure, write_png, write_svg};
 pub use footprint::{MapTracer, Raster, RasterError, Sampling};
 pub use graticule::{GridLine, graticule, latitude, longitude};
 pub use lines::{LinesAbout, LinesFormat, RidgeLine, geojson, vtk, write_netcdf};
-pub use make::{MapOptions, MapRecord, MapResult, PanelRecord, make};
+pub use make::{MOST_NODES, MapOptions, MapRecord, MapResult, PanelRecord, make};
 pub use moment::Moment;
 pub use projection::{Projection, ProjectionKind};
 pub use ridges::{Field, RidgePoint, Strength};

@@ -36,7 +36,7 @@ pub struct Strength {
 
 impl Default for Strength {
     fn default() -> Self {
-        Self { percentile: 80.0, length: 15.0, smoothing: 1.0 }
+        Self { percentile: 80.0, length: 30.0, smoothing: 2.0 }
     }
 }
 
