@@ -17,7 +17,7 @@ fn every_field_of_the_record_has_its_row() {
     let page = page("maps.md");
     let rows: String = page.lines().filter(|line| line.starts_with("| `")).collect();
     for name in ["MapRecord", "RidgeRecord", "PanelRecord"] {
-        let fields = fields("src/map/make.rs", name);
+        let fields = fields("src/map/record.rs", name);
         assert!(fields.len() >= 4, "{name}: {fields:?}");
         for field in fields {
             assert!(rows.contains(&format!("`{field}`")), "{name}: docs/maps.md has no `{field}`");
