@@ -167,11 +167,10 @@ pub fn write_png(figure: &MapFigure) -> Result<Vec<u8>, DrawError> {
 }
 
 fn png(width: usize, height: usize, pixels: &[u8]) -> Result<Vec<u8>, DrawError> {
-    let picture = RgbImage::from_raw(width as u32, height as u32, pixels)
-        .ok_or_else(|| plot_error("the picture has another size than its buffer"))?;
-    let mut bytes = Cursor::new(Vec::new());
-    picture.write_to(&mut bytes, ImageFormat::Png)?;
-    Ok(bytes.into_inner())
+    let mut bytes = Vec::new();
+    let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
+    encoder.write_image(pixels, width as u32, height as u32, ExtendedColorType::Rgb8)?;
+    Ok(bytes)
 }
 
 /// Draws a map as SVG: lines and words as such, the pixels of each panel as a PNG inside.
