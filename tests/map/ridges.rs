@@ -89,7 +89,7 @@ fn curved_ridges_close_and_filters_choose() {
     let profile = |r: f64, at: f64| (-((r - at) / 0.12).powi(2)).exp();
     let of = |x: f64, y: f64| profile(x.hypot(y), 0.7) + 0.4 * profile(x.hypot(y), 0.25);
     // x in half units.
-    let mut squeezed = field([-1.0, -1.0], 0.02, [101, 101], |x, y| of(x, y));
+    let mut squeezed = field([-1.0, -1.0], 0.02, [101, 101], of);
     squeezed.origin[0] /= 2.0;
     squeezed.step[0] /= 2.0;
     squeezed.scale = vec![[2.0, 1.0]; 101];
