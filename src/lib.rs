@@ -2,7 +2,7 @@
 //!
 //! The rooms; a room calls only those to its left:
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`], [`steer`] ← [`dashboard`], [`chart`] ← [`config`] ← the command line.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`], [`steer`] ← [`dashboard`], [`chart`], [`map`] ← [`config`] ← the command line.
 //!
 //! Each room defines its settings and checks them with [`setting`]; [`config`] reads them from a scene file and finds the line of a fault.
 //! All rooms may call [`files`], [`progress`], [`setting`] and [`simd`]. Every room up to [`backend`] is a crate of its own.
@@ -13,6 +13,7 @@
 pub mod chart;
 pub mod config;
 pub mod dashboard;
+pub mod map;
 pub mod publish;
 pub mod run;
 pub mod steer;

@@ -8,7 +8,6 @@ use super::settings::{Storage, WhenLost};
 use super::{BackendError, DeviceError};
 use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
-#[cfg(feature = "cuda")]
 use ridgewatch_surrogate::Trace;
 #[cfg(feature = "cuda")]
 use std::sync::Arc;
@@ -91,6 +90,44 @@ impl Device {
         !matches!(self, Self::Cpu { .. })
     }
 
+    /// Flow map for seeds at the start time `t0`. If the device cannot and the settings allow the CPU to take over, it is that of the CPU and a
+    /// note says why.
+    ///
+    /// # Errors
+    /// The flow map is invalid, or the device fails and the settings do not allow the CPU to take over.
+    pub fn tracer(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<(Box<dyn Trace>, Option<String>), BackendError> {
+        #[cfg_attr(not(feature = "cuda"), allow(unused_mut))] // no other device fails
+        let mut note = None;
+        match self {
+            Self::Cpu { .. } => {}
+            #[cfg(feature = "cuda")]
+            Self::Cuda(CudaDevice { gpu, storage, .. }) => {
+                let tuning = Tuning { storage: *storage, ..Tuning::default() };
+                match CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning) {
+                    Ok(tracer) => return Ok((Box::new(tracer), None)),
+                    Err(BackendError::Device(error)) if self.may_fall_back(&error) => note = Some(format!("traced on the CPU: {error}")),
+                    Err(error) => return Err(error),
+                }
+            }
+        }
+        Ok((Box::new(cpu_tracer(velocity.clone(), map, t0)?), note))
+    }
+
+    /// True if the settings allow the CPU to take over after this error.
+    pub fn may_fall_back(&self, #[cfg_attr(not(feature = "cuda"), allow(unused_variables))] error: &DeviceError) -> bool {
+        match self {
+            Self::Cpu { .. } => false,
+            #[cfg(feature = "cuda")]
+            Self::Cuda(CudaDevice { when_lost, may_fall_back, .. }) => {
+                if error.is_fault() {
+                    *when_lost == WhenLost::Cpu
+                } else {
+                    *may_fall_back
+                }
+            }
+        }
+    }
+
     /// Traces one set of seeds at the start time `t0`. If the device cannot and the settings allow the CPU to take over, the CPU
     /// traces them and a note says why.
     ///
@@ -104,13 +141,13 @@ impl Device {
         match self {
             Self::Cpu { .. } => {}
             #[cfg(feature = "cuda")]
-            Self::Cuda(CudaDevice { gpu, storage, when_lost, may_fall_back }) => {
+            Self::Cuda(CudaDevice { gpu, storage, .. }) => {
                 let tuning = Tuning { storage: *storage, ..Tuning::default() };
                 let tracer = CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning);
                 begun = Instant::now();
                 match tracer.and_then(|tracer| Ok(tracer.trace(seeds, Extras::default(), &mut traced).map(|()| tracer)?)) {
                     Ok(tracer) => return Ok(TracedOnce { flow: tracer.into_host(), traced, seconds: begun.elapsed().as_secs_f64(), note }),
-                    Err(BackendError::Device(error)) if if error.is_fault() { *when_lost == WhenLost::Cpu } else { *may_fall_back } => {
+                    Err(BackendError::Device(error)) if self.may_fall_back(&error) => {
                         note = Some(format!("traced on the CPU: {error}"));
                     }
                     Err(error) => return Err(error),

@@ -9,6 +9,7 @@ mod dashboard;
 mod doctor;
 mod ftle;
 mod inspect;
+mod map;
 pub mod messages;
 mod notify;
 mod process;
@@ -56,6 +57,8 @@ enum Command {
     Render(render::Options),
     /// Compute the FTLE field on a grid as NetCDF; `--check` compares it with the truth.
     Ftle(ftle::Options),
+    /// Draw the FTLE of one moment as a map, with its ridge lines.
+    Map(map::Options),
     /// Chart speed against accuracy of a scene: methods and settings, the Pareto front, and the pick.
     Chart(chart::Options),
     /// Train the scene's network offline on a still window, and show how its error falls.
@@ -100,6 +103,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Clean(options) => clean::run(&common, &options),
         Command::Render(options) => render::run(&common, options),
         Command::Ftle(options) => ftle::run(&common, &options),
+        Command::Map(options) => map::run(&common, &options),
         Command::Chart(options) => chart::run(&common, &options),
         Command::Train(options) => train::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),

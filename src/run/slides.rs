@@ -51,6 +51,11 @@ pub trait Slides: Send {
     /// Total number of slides; `None` if unknown.
     fn expected(&self) -> Option<u64>;
 
+    /// A time of the source as a date; `None` if the source has no calendar or no snapshot at that time.
+    fn date(&self, _time: f64) -> Option<String> {
+        None
+    }
+
     /// For a running simulation, true until the next window is complete. `None` for other sources.
     fn is_awaited(&self) -> Option<bool> {
         None
@@ -169,15 +174,20 @@ impl Slides for ArchiveSlides {
         }
         *taken = 0;
         let time = seed_time(window, self.direction)?;
+        let velocity = VelocitySource::Window(Arc::new(window.clone()));
         Ok(Some(Slide {
             index: self.count.next(),
             time,
-            date: self.dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone()),
+            date: self.date(time),
             live: None,
-            velocity: VelocitySource::Window(Arc::new(window.clone())),
+            velocity,
             warnings,
             waited: start.elapsed().as_secs_f64(),
         }))
+    }
+
+    fn date(&self, time: f64) -> Option<String> {
+        self.dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone())
     }
 
     fn listen(&self, listener: Listener) {

@@ -1,6 +1,7 @@
 //! Pages of the documentation, compared with the program that they describe.
 #![allow(clippy::unwrap_used)] // Tests: a panic is the report.
 
+mod maps;
 #[path = "../network_support/mod.rs"]
 mod network_support;
 mod protocol;

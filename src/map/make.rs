@@ -1,0 +1,399 @@
+//! From a moment to the figure of its map, its record and its ridge lines.
+
+use super::arrows::{Arrows, arrows};
+use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
+use super::contour::contours;
+use super::draw::{Bar, MapFigure, Panel};
+use super::footprint::{MapTracer, Raster, RasterError, Sampling};
+use super::graticule::axis_unit;
+use super::lines::{LinesAbout, RidgeLine};
+use super::projection::ProjectionKind;
+use super::record::{MapRecord, PanelRecord, RidgeRecord};
+use super::ridges::{Field, Strength};
+use super::view::{View, is_geographic};
+use super::words::{Rate, date, duration, number};
+use super::{MapError, Moment};
+use crate::backend::Device;
+use crate::field::EARTH_RADIUS;
+use crate::flow::{Direction, FlowMap, VelocitySource};
+use crate::run::{Plan, RunError};
+use std::path::Path;
+
+/// Most nodes of the grid on which ridges are found: some GiB of memory.
+pub const MOST_NODES: usize = 1 << 24;
+
+/// What a map shows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapOptions {
+    /// Pixels of the longer edge of a panel.
+    pub pixels: usize,
+    /// Seeds per pixel.
+    pub sampling: Sampling,
+    /// Projection; `None`: the one that fits.
+    pub projection: Option<ProjectionKind>,
+    /// Third coordinate of all seeds; `None`: the middle of the domain. Two-dimensional flows take none.
+    pub level: Option<f64>,
+    /// Forward and backward FTLE in one picture.
+    pub both: bool,
+    /// Range of colours in the unit of the map; `None`: from the values.
+    pub range: Option<[f64; 2]>,
+    /// Levels that get a line, in the unit of the map.
+    pub contours: Vec<f64>,
+    /// Arrows of the velocity.
+    pub arrows: bool,
+    /// Ridge lines; `None`: none.
+    pub ridges: Option<Strength>,
+    /// Nodes of the grid on which ridges are found; `None`: two per pixel along x and y.
+    pub ridge_grid: Option<[usize; 2]>,
+}
+
+/// What a map came to.
+pub struct MapResult {
+    /// The picture, to be drawn.
+    pub figure: MapFigure,
+    /// The record beside it.
+    pub record: MapRecord,
+    /// Ridge lines of all panels.
+    pub lines: Vec<RidgeLine>,
+    /// What files of lines say.
+    pub about: LinesAbout,
+    /// Remarks for the user.
+    pub notes: Vec<String>,
+}
+
+/// One traced field.
+struct Traced {
+    direction: Direction,
+    tau: f64,
+    raster: Raster,
+    steps: usize,
+    difference: Option<f64>,
+    ridges: Vec<RidgeLine>,
+}
+
+/// Makes the map of a moment. Calls `progress` with the seeds traced and those in all.
+///
+/// # Errors
+/// An option does not fit the domain, or the device fails.
+pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &mut dyn FnMut(u64, u64)) -> Result<MapResult, MapError> {
+    let plan = &moment.plan;
+    let domain = &plan.domain;
+    let level = level(options.level, domain)?;
+    let geographic = is_geographic(&moment.velocity);
+    let view = View::new(domain, geographic, options.projection, level, options.pixels).map_err(|why| {
+        MapError::Usage(match options.projection {
+            Some(kind) => format!("--projection {}: {why}", crate::setting::word(kind)),
+            None => why,
+        })
+    })?;
+    let rate = Rate::fitting(&plan.time_unit, moment.taus.iter().copied().fold(0.0, f64::max));
+    let directions = if options.both { vec![Direction::Forward, Direction::Backward] } else { vec![plan.map.direction] };
+    let nodes = options.ridges.map(|_| options.ridge_grid.unwrap_or_else(|| ridge_nodes(&view)));
+    let mut notes = Vec::new();
+    let each = (view.size[0] * view.size[1] * options.sampling.seeds + nodes.map_or(0, |[x, y]| x * y)) as u64;
+    let (mut done, total) = (0, each * (moment.taus.len() * directions.len()) as u64);
+    let mut traced = Vec::new();
+    for &tau in &moment.taus {
+        for &direction in &directions {
+            let map = FlowMap { direction, ..moment.map(tau) };
+            let mut tracer = MapTracer::new(device, &moment.velocity, &map, moment.time).map_err(RunError::of)?;
+            let mut count = |seeds: u64| {
+                done += seeds;
+                progress(done, total);
+            };
+            let raster = Raster::trace(&view, &mut tracer, options.sampling, &mut |pixels| count((pixels * options.sampling.seeds) as u64))
+                .map_err(RunError::of)?;
+            let mut ridges = Vec::new();
+            if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
+                let field = ridge_field(&view, &mut tracer, size, &mut |seeds| count(seeds as u64))?;
+                let kind = if direction == Direction::Forward { "repelling" } else { "attracting" };
+                ridges = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
+            }
+            let flow = tracer.flow();
+            let difference = flow.step_choice().map(|chosen| chosen.difference).filter(|d| d.is_finite());
+            let steps = flow.steps();
+            notes.extend(tracer.note.take());
+            traced.push(Traced { direction, tau, raster, steps, difference, ridges });
+        }
+    }
+    if traced.iter().all(|t| t.raster.mean.iter().all(|v| v.is_nan())) {
+        return Err(MapError::AllMissing(when(moment)));
+    }
+    let values: Vec<&[f32]> = traced.iter().map(|t| &t.raster.mean[..]).collect();
+    let shown = options.range.unwrap_or_else(|| range(&values, options.both).map(|v| v * rate.factor));
+    let scale = shown.map(|v| v / rate.factor);
+    let found = options.arrows.then(|| arrows(&view, &moment.velocity, moment.time, 26.0));
+    let figure = figure(moment, options, &view, &traced, &rate, shown, scale, found.as_ref());
+    let record = MapRecord {
+        version: env!("CARGO_PKG_VERSION"),
+        title: plan.scene.title.clone(),
+        source: plan.source.clone(),
+        time: moment.time,
+        date: moment.date.clone(),
+        time_unit: plan.time_unit.clone(),
+        level: (domain.dimensions == 3).then_some(level),
+        projection: view.projection.kind(),
+        region: view.region,
+        pixels: view.size,
+        sampling: options.sampling,
+        ftle_unit: rate.unit.clone(),
+        range: shown,
+        fastest: found.map(|arrows| arrows.fastest),
+        ridges: options.ridges.zip(nodes).map(|(Strength { percentile, length, smoothing }, grid)| RidgeRecord {
+            grid,
+            percentile,
+            length,
+            smoothing,
+        }),
+        panels: traced.iter().map(|t| panel_record(t, options, &rate, shown)).collect(),
+    };
+    let about = LinesAbout {
+        title: plan.scene.title.clone(),
+        source: plan.source.clone(),
+        when: when(moment),
+        time_unit: plan.time_unit.clone(),
+        rate,
+        is_geographic: geographic,
+        axes: axes(&moment.velocity).map(|(name, unit)| [name, unit]),
+        level,
+    };
+    let lines = traced.into_iter().flat_map(|t| t.ridges).collect();
+    Ok(MapResult { figure, record, lines, about, notes })
+}
+
+/// Third coordinate of the seeds.
+fn level(given: Option<f64>, domain: &crate::field::Domain) -> Result<f64, MapError> {
+    let (low, high) = (domain.min[2], domain.max[2]);
+    match given {
+        None => Ok((low + high) / 2.0),
+        Some(level) if domain.dimensions == 2 => {
+            Err(MapError::Usage(format!("--level {level}: the flow has two dimensions; accepted: a map without --level")))
+        }
+        Some(level) if (low..=high).contains(&level) => Ok(level),
+        Some(level) => Err(MapError::Usage(format!("--level {level}: accepted: {low} to {high}, the third axis of the domain"))),
+    }
+}
+
+/// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes [`MOST_NODES`].
+fn ridge_nodes(view: &View) -> [usize; 2] {
+    let [west, south, east, north] = view.region;
+    let shrink = if view.is_geographic { ((south + north) / 2.0).to_radians().cos().max(0.1) } else { 1.0 };
+    let ratio = (east - west) * shrink / (north - south);
+    let nodes = (4 * view.size[0] * view.size[1]).min(MOST_NODES / 2);
+    let across = (nodes as f64 * ratio).sqrt();
+    [across, across / ratio].map(|n| (n.round() as usize + 1).max(8))
+}
+
+/// The FTLE at nodes from edge to edge of the data.
+fn ridge_field(view: &View, tracer: &mut MapTracer<'_>, size: [usize; 2], done: &mut dyn FnMut(usize)) -> Result<Field, MapError> {
+    let [west, south, east, north] = view.region;
+    let step = [(east - west) / (size[0] - 1) as f64, (north - south) / (size[1] - 1) as f64];
+    let at = |i: usize, j: usize| [west + step[0] * i as f64, south + step[1] * j as f64];
+    let mut values = Vec::with_capacity(size[0] * size[1]);
+    // Some rows at once, which bounds the memory.
+    let rows = ((1 << 19) / size[0]).max(1);
+    for first in (0..size[1]).step_by(rows) {
+        let seeds: Vec<_> = (first..(first + rows).min(size[1]))
+            .flat_map(|j| (0..size[0]).map(move |i| (i, j)))
+            .map(|(i, j)| view.seed(at(i, j)))
+            .collect();
+        values.extend(tracer.ftle(&seeds, done).map_err(RunError::of)?);
+    }
+    let kilometres = (EARTH_RADIUS / 1000.0).to_radians();
+    let scale = (0..size[1])
+        .map(|j| if view.is_geographic { [kilometres * at(0, j)[1].to_radians().cos().max(0.0), kilometres] } else { [1.0; 2] })
+        .collect();
+    Ok(Field { origin: [west, south], step, size, values, scale })
+}
+
+/// Names and units of the first two coordinates.
+fn axes(velocity: &VelocitySource) -> [(String, String); 2] {
+    [0, 1].map(|k| match velocity {
+        VelocitySource::Window(window) => {
+            window.grid().and_then(|g| g.axes.get(k)).map_or_else(Default::default, |a| (a.name().to_owned(), a.units().to_owned()))
+        }
+        VelocitySource::Analytic(..) => (["x", "y"][k].into(), String::new()),
+    })
+}
+
+/// Title of the scene, else its files.
+fn name(plan: &Plan) -> String {
+    let files = &plan.scene.archive.files;
+    if !plan.scene.title.is_empty() {
+        return plan.scene.title.clone();
+    }
+    let Some(first) = files.first() else { return String::new() };
+    // A pattern without a name of its own is called by its folder.
+    let stem = |path: &Path| {
+        path.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().trim_matches(['*', '_', '-', '.']).to_owned())
+    };
+    let name = Some(stem(first)).filter(|name| !name.is_empty()).unwrap_or_else(|| first.parent().map_or_else(String::new, stem));
+    if files.len() > 1 { format!("{name} and further files") } else { name }
+}
+
+/// Seed time in words.
+fn when(moment: &Moment) -> String {
+    let unit = &moment.plan.time_unit;
+    moment.date.as_deref().map_or_else(|| format!("t = {} {unit}", number(moment.time)).trim_end().to_owned(), date)
+}
+
+fn panel_record(traced: &Traced, options: &MapOptions, rate: &Rate, shown: [f64; 2]) -> PanelRecord {
+    let raster = &traced.raster;
+    let known = || raster.mean.iter().filter(|v| v.is_finite()).map(|v| f64::from(*v) * rate.factor);
+    let count = known().count();
+    let error = raster.error.map(|e| RasterError { rms: e.rms * rate.factor, interval: e.interval.map(|v| v * rate.factor), ..e });
+    let within = raster.missing.iter().filter(|m| m.is_finite()).count();
+    PanelRecord {
+        direction: traced.direction,
+        tau: traced.tau,
+        steps: traced.steps,
+        integration_difference: traced.difference,
+        error,
+        error_share: error.map(|e| e.rms / (shown[1] - shown[0])),
+        ftle: (count > 0).then(|| {
+            [known().fold(f64::INFINITY, f64::min), known().sum::<f64>() / count as f64, known().fold(f64::NEG_INFINITY, f64::max)]
+        }),
+        missing_share: (0..raster.missing.len()).filter(|p| raster.is_land(*p)).count() as f64 / within.max(1) as f64,
+        failed_seeds: raster.failed,
+        ridge_lines: options.ridges.map(|_| traced.ridges.len()),
+        colours: ramp(options.both, traced.direction).name(),
+    }
+}
+
+fn ramp(both: bool, direction: Direction) -> Ramp {
+    match (both, direction) {
+        (false, _) => Ramp::Viridis,
+        (true, Direction::Forward) => Ramp::Reds,
+        (true, Direction::Backward) => Ramp::Blues,
+    }
+}
+
+/// Names of structures by the direction that shows them.
+fn structures(direction: Direction) -> &'static str {
+    match direction {
+        Direction::Forward => "repelling",
+        Direction::Backward => "attracting",
+    }
+}
+
+#[allow(clippy::too_many_arguments)] // the parts of one picture
+fn figure(
+    moment: &Moment,
+    options: &MapOptions,
+    view: &View,
+    traced: &[Traced],
+    rate: &Rate,
+    shown: [f64; 2],
+    scale: [f64; 2],
+    found: Option<&Arrows>,
+) -> MapFigure {
+    let plan = &moment.plan;
+    let per_panel = if options.both { 2 } else { 1 };
+    let panels: Vec<Panel> = traced.chunks(per_panel).map(|fields| panel(fields, options, view, rate, scale, found)).collect();
+    let bars = traced[..per_panel]
+        .iter()
+        .map(|t| {
+            let unit = if rate.unit.is_empty() { String::new() } else { format!(", {}", rate.unit) };
+            let values = || traced.iter().filter(|o| o.direction == t.direction).flat_map(|o| &o.raster.mean).filter(|v| v.is_finite());
+            Bar {
+                label: format!("{} FTLE ({} structures){unit}", t.direction.name(), structures(t.direction)),
+                ramp: ramp(options.both, t.direction),
+                range: shown,
+                goes_on: [values().any(|v| f64::from(*v) < scale[0]), values().any(|v| f64::from(*v) > scale[1])],
+            }
+        })
+        .collect();
+    let tau = if moment.taus.len() == 1 { format!(", tau = {}", duration(moment.taus[0], &plan.time_unit)) } else { String::new() };
+    let names = axes(&moment.velocity);
+    let level = if plan.domain.dimensions == 3 {
+        let (name, unit) = match &moment.velocity {
+            VelocitySource::Window(window) => window
+                .grid()
+                .and_then(|g| g.axes.get(2))
+                .map_or(("z".into(), String::new()), |a| (a.name().to_owned(), a.units().to_owned())),
+            VelocitySource::Analytic(..) => ("z".into(), String::new()),
+        };
+        let (unit, divisor) = axis_unit(&unit, view.level.abs());
+        let value = number(view.level / divisor);
+        format!(", level {value} {unit} ({name})").replace("  ", " ")
+    } else {
+        String::new()
+    };
+    let what = if options.both {
+        "Forward and backward FTLE".to_owned()
+    } else {
+        format!("{} FTLE", if plan.map.direction == Direction::Forward { "Forward" } else { "Backward" })
+    };
+    let errors: Vec<f64> = traced.iter().filter_map(|t| t.raster.error).map(|e| e.rms * rate.factor).collect();
+    let largest = errors.iter().copied().fold(0.0, f64::max);
+    let mut footer = vec![format!("Source: {}", plan.source)];
+    let error = if errors.is_empty() {
+        String::new()
+    } else {
+        format!(", error {} rms ({} % of the colours)", rate.words(largest), number(100.0 * largest / (shown[1] - shown[0])))
+    };
+    let colours: Vec<&str> = traced[..per_panel].iter().map(|t| ramp(options.both, t.direction).name()).collect();
+    footer.push(format!("Pixels: mean of {} seeds{error}. Colours: {}.", options.sampling.seeds, colours.join(", ")));
+    let speed = found.map(|arrows| {
+        // Velocities on the sphere are metres, others are in the unit of the axes.
+        let length = if view.is_geographic { "m" } else { names[0].1.as_str() };
+        let unit = if length.is_empty() || plan.time_unit.is_empty() { String::new() } else { format!(" {length}/{}", plan.time_unit) };
+        format!("Longest arrow: {}{unit}.", number(arrows.fastest))
+    });
+    let contours = (!options.contours.is_empty())
+        .then(|| format!("Lines: {}.", options.contours.iter().map(|c| rate.words(*c)).collect::<Vec<_>>().join(", ")));
+    let ridges = options.ridges.map(|_| format!("Ridge lines: {}.", traced.iter().map(|t| t.ridges.len()).sum::<usize>()));
+    let missing = traced.iter().any(|t| t.raster.missing.iter().any(|m| *m >= 0.5)).then(|| "Grey: land or missing.".to_owned());
+    let projection = Some(format!("Projection: {}.", view.projection.words()));
+    footer.push([projection, missing, ridges, contours, speed].into_iter().flatten().collect::<Vec<_>>().join(" "));
+    MapFigure {
+        title: format!("{what}: {}", name(plan)).trim_end_matches([':', ' ']).to_owned(),
+        subtitle: format!("{}{tau}{level}", when(moment)),
+        footer,
+        axes: if view.is_geographic { None } else { Some(names) },
+        view: view.clone(),
+        panels,
+        bars,
+        caption_unit: plan.time_unit.clone(),
+    }
+}
+
+fn panel(fields: &[Traced], options: &MapOptions, view: &View, rate: &Rate, scale: [f64; 2], found: Option<&Arrows>) -> Panel {
+    let raster = &fields[0].raster;
+    let share = |v: f32| (f64::from(v) - scale[0]) / (scale[1] - scale[0]);
+    let colour = |pixel: usize| {
+        if raster.missing[pixel].is_nan() {
+            return OUTSIDE;
+        }
+        if raster.is_land(pixel) || fields.iter().any(|f| f.raster.mean[pixel].is_nan()) {
+            return LAND;
+        }
+        let one = |f: &Traced| ramp(options.both, f.direction).colour(share(f.raster.mean[pixel]));
+        fields[1..].iter().fold(one(&fields[0]), |under, field| overprinted(under, one(field)))
+    };
+    // Values are those of the centres of pixels.
+    let centred = |lines: Vec<Vec<[f64; 2]>>| lines.into_iter().map(|line| line.into_iter().map(|p| p.map(|c| c + 0.5)).collect());
+    let levels = || options.contours.iter().map(|level| (level / rate.factor) as f32);
+    let ridge_colour = |f: &Traced| match (options.both, f.direction) {
+        (false, _) => [0, 0, 0],
+        (true, Direction::Forward) => [120, 0, 0],
+        (true, Direction::Backward) => [0, 20, 110],
+    };
+    Panel {
+        tau: fields[0].tau,
+        pixels: (0..raster.mean.len()).map(colour).collect(),
+        coast: centred(contours(&raster.missing, raster.size, 0.5)).collect(),
+        contours: fields
+            .iter()
+            .flat_map(|f| levels().map(|level| contours(&f.raster.mean, f.raster.size, level)).collect::<Vec<_>>())
+            .flat_map(centred)
+            .collect(),
+        ridges: fields
+            .iter()
+            .flat_map(|f| {
+                f.ridges.iter().map(|line| (ridge_colour(f), line.points.iter().map(|p| view.pixel(p.place)).collect())).collect::<Vec<_>>()
+            })
+            .collect(),
+        arrows: found.map_or_else(Vec::new, |found| found.arrows.clone()),
+    }
+}

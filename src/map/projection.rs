@@ -1,0 +1,176 @@
+//! Projections of the sphere onto the plane of a map, and back (Snyder, Map projections: a working manual, USGS professional paper 1395, 1987).
+
+use serde::{Deserialize, Serialize};
+use std::f64::consts::FRAC_PI_4;
+
+/// Kind of a projection, as it is named on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProjectionKind {
+    /// Longitude and latitude as x and y, with x shortened by the cosine of the middle latitude.
+    PlateCarree,
+    /// Mercator: conformal, meridians are parallel.
+    Mercator,
+    /// Lambert's conformal cone of two standard parallels.
+    Lambert,
+    /// Polar stereographic: conformal, a pole is the centre.
+    Polar,
+    /// The coordinates themselves.
+    Plain,
+}
+
+/// A projection. Planes have the unit of the sphere's radius, or of the coordinates for [`Self::Plain`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Projection {
+    /// [`ProjectionKind::PlateCarree`]: the factor of x.
+    PlateCarree {
+        /// Cosine of the latitude at which east and north have one scale.
+        cosine: f64,
+    },
+    /// [`ProjectionKind::Mercator`].
+    Mercator,
+    /// [`ProjectionKind::Lambert`], equations 15-1 to 15-11.
+    Lambert {
+        /// Longitude that points up, degrees.
+        middle: f64,
+        /// Sine of the cone.
+        n: f64,
+        /// Factor of the distance from the cone's top.
+        factor: f64,
+    },
+    /// [`ProjectionKind::Polar`], equations 21-5 to 21-11.
+    Polar {
+        /// Longitude that points down from the north pole (up from the south pole), degrees.
+        middle: f64,
+        /// 1 for the north pole, -1 for the south pole.
+        pole: f64,
+    },
+    /// [`ProjectionKind::Plain`].
+    Plain,
+}
+
+/// ln tan(pi/4 + latitude/2), for a latitude in degrees.
+fn isometric(latitude: f64) -> f64 {
+    (FRAC_PI_4 + latitude.to_radians() / 2.0).tan().ln()
+}
+
+/// Inverse of [`isometric`].
+fn latitude_of(isometric: f64) -> f64 {
+    2.0 * (isometric.exp().atan() - FRAC_PI_4).to_degrees()
+}
+
+/// Most polar latitude that Mercator reaches, in degrees.
+const MERCATOR_END: f64 = 85.0;
+
+impl ProjectionKind {
+    /// The kind that fits a region: plain for Cartesian coordinates; polar near a pole; plate carree for regions of at most 40 by 25 degrees and
+    /// for those that go around the globe; Lambert on one side of the equator in middle latitudes; otherwise Mercator.
+    /// `west`, `south`, `east`, `north` in degrees.
+    pub fn fitting([west, south, east, north]: [f64; 4]) -> Self {
+        let (width, height, middle) = (east - west, north - south, (south + north) / 2.0);
+        let (nearest, farthest) = if south * north <= 0.0 {
+            (0.0, south.abs().max(north.abs()))
+        } else {
+            (south.abs().min(north.abs()), south.abs().max(north.abs()))
+        };
+        if (nearest >= 55.0 && farthest > 75.0) || (nearest >= 30.0 && farthest > 80.0) {
+            Self::Polar
+        } else if width > 180.0 || farthest > 80.0 || (width <= 40.0 && height <= 25.0 && farthest <= 70.0) {
+            Self::PlateCarree
+        } else if nearest > 0.0 && (25.0..=70.0).contains(&middle.abs()) && width <= 120.0 {
+            Self::Lambert
+        } else {
+            Self::Mercator
+        }
+    }
+}
+
+impl Projection {
+    /// The projection of a kind for a region, in degrees.
+    ///
+    /// # Errors
+    /// The kind cannot show the region; the text says why and what is accepted.
+    pub fn new(kind: ProjectionKind, [west, south, east, north]: [f64; 4]) -> Result<Self, String> {
+        let (middle, latitude) = ((west + east) / 2.0, (south + north) / 2.0);
+        match kind {
+            ProjectionKind::Plain => Ok(Self::Plain),
+            ProjectionKind::PlateCarree if east - west > 180.0 => Ok(Self::PlateCarree { cosine: 1.0 }),
+            ProjectionKind::PlateCarree => Ok(Self::PlateCarree { cosine: latitude.to_radians().cos() }),
+            ProjectionKind::Mercator if south < -MERCATOR_END || north > MERCATOR_END => Err(format!(
+                "mercator ends at {MERCATOR_END} degrees, and the data reach from {south:.2} to {north:.2}; accepted: plate_carree, polar"
+            )),
+            ProjectionKind::Mercator => Ok(Self::Mercator),
+            ProjectionKind::Lambert if south * north <= 0.0 || east - west > 180.0 => {
+                Err("lambert shows one side of the equator and at most 180 degrees of longitude; accepted: plate_carree, mercator".into())
+            }
+            ProjectionKind::Lambert => {
+                // Standard parallels a sixth of the height inside, as in common use (Snyder, page 105).
+                let [first, second] = [south + (north - south) / 6.0, north - (north - south) / 6.0];
+                let n = (first.to_radians().cos() / second.to_radians().cos()).ln() / (isometric(second) - isometric(first));
+                Ok(Self::Lambert { middle, n, factor: first.to_radians().cos() * (n * isometric(first)).exp() / n })
+            }
+            ProjectionKind::Polar if south * north <= 0.0 => {
+                Err("polar shows one side of the equator; accepted: plate_carree, mercator".into())
+            }
+            ProjectionKind::Polar => Ok(Self::Polar { middle, pole: latitude.signum() }),
+        }
+    }
+
+    /// Kind of this projection.
+    pub fn kind(&self) -> ProjectionKind {
+        match self {
+            Self::PlateCarree { .. } => ProjectionKind::PlateCarree,
+            Self::Mercator => ProjectionKind::Mercator,
+            Self::Lambert { .. } => ProjectionKind::Lambert,
+            Self::Polar { .. } => ProjectionKind::Polar,
+            Self::Plain => ProjectionKind::Plain,
+        }
+    }
+
+    /// What the map says of its projection.
+    pub fn words(&self) -> String {
+        match *self {
+            Self::PlateCarree { cosine: 1.0 } => "plate carrée".into(),
+            Self::PlateCarree { cosine } => format!("plate carrée, shortened east-west by cos {:.1}°", cosine.acos().to_degrees()),
+            Self::Mercator => "Mercator".into(),
+            Self::Lambert { middle, .. } => format!("Lambert conformal conic about {middle:.1}°"),
+            Self::Polar { middle, .. } => format!("polar stereographic about {middle:.1}°"),
+            Self::Plain => "plain coordinates".into(),
+        }
+    }
+
+    /// From coordinates (degrees) to the plane, x to the right and y up.
+    pub fn forward(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        match *self {
+            Self::Plain => [x, y],
+            Self::PlateCarree { cosine } => [x.to_radians() * cosine, y.to_radians()],
+            Self::Mercator => [x.to_radians(), isometric(y)],
+            Self::Lambert { middle, n, factor } => {
+                let (rho, theta) = (factor * (-n * isometric(y)).exp(), n * (x - middle).to_radians());
+                [rho * theta.sin(), -rho * theta.cos()]
+            }
+            Self::Polar { middle, pole } => {
+                let (rho, theta) = (2.0 * (FRAC_PI_4 - pole * y.to_radians() / 2.0).tan(), (x - middle).to_radians());
+                [rho * theta.sin(), -pole * rho * theta.cos()]
+            }
+        }
+    }
+
+    /// From the plane to coordinates. Longitudes of cones and poles lie within 180 degrees of the middle.
+    pub fn inverse(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        match *self {
+            Self::Plain => [x, y],
+            Self::PlateCarree { cosine } => [(x / cosine).to_degrees(), y.to_degrees()],
+            Self::Mercator => [x.to_degrees(), latitude_of(y)],
+            Self::Lambert { middle, n, factor } => {
+                let rho = n.signum() * x.hypot(y);
+                let theta = (n.signum() * x).atan2(-n.signum() * y);
+                [middle + (theta / n).to_degrees(), latitude_of((factor / rho).ln() / n)]
+            }
+            Self::Polar { middle, pole } => {
+                let theta = x.atan2(-pole * y);
+                [middle + theta.to_degrees(), pole * (90.0 - 2.0 * (x.hypot(y) / 2.0).atan().to_degrees())]
+            }
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! Maps: pixels against closed forms, projections, land, ridges, and what the command refuses.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report, and figures are printed.
+
+mod command;
+#[path = "../kit/mod.rs"]
+mod kit;
+mod pixels;
+mod projections;
+mod ridges;

@@ -1,0 +1,158 @@
+//! Ridge lines against closed forms and against a finer grid.
+
+use crate::kit::flow::{stretches, trace};
+use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, Window, analytic::Analytic};
+use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, VelocitySource};
+use ridgewatch::map::{Field, RidgePoint, Strength};
+use std::f64::consts::TAU as TURN;
+use std::sync::Arc;
+
+/// A closed form at the nodes of a grid.
+fn field(origin: [f64; 2], step: f64, size: [usize; 2], of: impl Fn(f64, f64) -> f64) -> Field {
+    let value = |k: usize| of(origin[0] + step * (k % size[0]) as f64, origin[1] + step * (k / size[0]) as f64) as f32;
+    Field { origin, step: [step; 2], size, values: (0..size[0] * size[1]).map(value).collect(), scale: vec![[1.0; 2]; size[1]] }
+}
+
+const ALL: Strength = Strength { percentile: 0.0, length: 5.0, smoothing: 0.0 };
+
+/// FTLE of u = sin x, v = -y over tau: tan(X / 2) = e^tau tan(x / 2), so that dX/dx = e^tau / (cos^2 (x/2) + e^(2 tau) sin^2 (x/2)). Its ridge is x = 0.
+fn nonlinear_saddle(x: f64, tau: f64) -> f64 {
+    let (sine, cosine) = (x / 2.0).sin_cos();
+    let stretch = tau.exp() / (cosine * cosine + (2.0 * tau).exp() * sine * sine);
+    stretch.ln().max(-tau) / tau
+}
+
+/// The ridge of a saddle whose axes are turned against the grid, in units of cells.
+#[test]
+fn the_saddle_is_exact_to_a_hundredth_of_a_cell() {
+    // exp(-1.5) = 0.22 is the width of the ridge: nine nodes of 0.025.
+    let (tau, step) = (1.5, 0.025);
+    for (angle, shift) in [(0.0, 0.0137), (0.0, 0.0071), (0.4, 0.003), (1.1, -0.011), (TURN / 8.0, 0.0049)] {
+        let (sine, cosine) = f64::sin_cos(angle);
+        let across = |x: f64, y: f64| cosine * x + sine * y - shift;
+        let field = field([-1.0, -1.0], step, [81, 81], |x, y| nonlinear_saddle(across(x, y), tau));
+        let lines = field.ridges(&ALL);
+        assert_eq!(lines.len(), 1, "{angle}: one ridge, in one piece");
+        let worst = lines[0].iter().map(|p| across(p.place[0], p.place[1]).abs()).fold(0.0, f64::max) / step;
+        let length = (lines[0][0].place[0] - lines[0][lines[0].len() - 1].place[0])
+            .hypot(lines[0][0].place[1] - lines[0][lines[0].len() - 1].place[1]);
+        println!("angle {angle:.2}, shift {shift}: worst {worst:.1e} cells, {} points", lines[0].len());
+        assert!(worst < 0.01 && length > 1.7, "{angle} {shift}: {worst} cells, length {length}");
+        // The largest FTLE is that of the fixed point: its rate.
+        assert!(lines[0].iter().all(|p| (p.value - 1.0).abs() < 0.01 && p.sharpness > 0.0));
+    }
+}
+
+/// The same saddle as data on a grid, through the integration of the program.
+#[test]
+fn the_saddle_of_a_traced_grid_is_exact_to_a_hundredth_of_a_cell() {
+    let axis = |name| Axis::uniform(name, "m", -1.25, 1.25, 251).unwrap();
+    let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+    let at = |k: usize| -1.25 + 0.01 * k as f64;
+    let u: Vec<f32> = (0..grid.nodes()).map(|k| at(k % 251).sin() as f32).collect();
+    let v: Vec<f32> = (0..grid.nodes()).map(|k| -at(k / 251) as f32).collect();
+    let mut window = Window::new(1.0);
+    for time in [0.0, 1.0] {
+        window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &v, &[]))).unwrap();
+    }
+    let map =
+        FlowMap { precision: Precision::F64, boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, ..FlowMap::tangent(1.0, 100) };
+    // Nodes beside those of the data.
+    let (origin, step, size) = ([-0.4037, -0.4011], 0.0257, [32, 32]);
+    let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
+        .map(|k| DomainPoint([(origin[0] + step * (k % size[0]) as f64) as f32, (origin[1] + step * (k / size[0]) as f64) as f32, 0.5]))
+        .collect();
+    let traced = stretches(&trace(&VelocitySource::Window(Arc::new(window)), &map, 0.0, &seeds, Extras::default()));
+    for (seed, s) in seeds.iter().zip(&traced) {
+        assert!((s - nonlinear_saddle(f64::from(seed.0[0]), 1.0)).abs() < 1e-3, "{seed:?}: {s}");
+    }
+    let values = traced.iter().map(|s| *s as f32).collect();
+    let lines = Field { origin, step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] }.ridges(&ALL);
+    assert_eq!(lines.len(), 1);
+    let worst = lines[0].iter().map(|p| p.place[0].abs()).fold(0.0, f64::max) / step;
+    println!("worst {worst:.1e} cells");
+    assert!(worst < 0.01, "{worst}");
+}
+
+/// A uniform field has none, nor has a valley.
+#[test]
+fn what_is_no_ridge_gives_none() {
+    let rounding = |x: f64, y: f64| 1.0 + 1e-7 * (1000.0 * x * y).sin();
+    assert_eq!(field([0.0; 2], 0.02, [60, 60], rounding).ridges(&ALL), Vec::<Vec<RidgePoint>>::new());
+    assert_eq!(field([-1.0; 2], 0.05, [40, 40], |x, _| 1.0 - (-4.0 * (x - 0.013) * (x - 0.013)).exp()).ridges(&ALL).len(), 0);
+    assert_eq!(field([0.0; 2], 0.02, [60, 60], |_, _| f64::NAN).ridges(&ALL), Vec::<Vec<RidgePoint>>::new());
+}
+
+/// A circle by symmetry, closed, on a grid whose coordinates have different lengths; and what the filters do.
+#[test]
+fn curved_ridges_close_and_filters_choose() {
+    let profile = |r: f64, at: f64| (-((r - at) / 0.12).powi(2)).exp();
+    let of = |x: f64, y: f64| profile(x.hypot(y), 0.7) + 0.4 * profile(x.hypot(y), 0.25);
+    // x in half units.
+    let mut squeezed = field([-1.0, -1.0], 0.02, [101, 101], of);
+    squeezed.origin[0] /= 2.0;
+    squeezed.step[0] /= 2.0;
+    squeezed.scale = vec![[2.0, 1.0]; 101];
+    let mut lines = squeezed.ridges(&ALL);
+    lines.sort_by_key(Vec::len);
+    assert_eq!(lines.len(), 2);
+    for (line, radius) in lines.iter().zip([0.25, 0.7]) {
+        assert_eq!(line.first(), line.last(), "closed");
+        let worst = line.iter().map(|p| ((2.0 * p.place[0]).hypot(p.place[1]) - radius).abs()).fold(0.0, f64::max) / 0.02;
+        println!("radius {radius}: worst {worst:.1e} cells");
+        // Circles of 0.25 have 12 nodes to their centre: the curvature is not small.
+        assert!(worst < if radius > 0.5 { 0.02 } else { 0.05 }, "{worst}");
+    }
+    let count = |strength: Strength| squeezed.ridges(&strength).len();
+    assert_eq!(count(Strength { percentile: 90.0, ..ALL }), 1, "the weaker one is below the percentile");
+    assert_eq!(count(Strength { length: 120.0, ..ALL }), 1, "the shorter one has 78 nodes");
+    assert_eq!(count(Strength { length: 400.0, ..ALL }), 0);
+    // A hole cuts the circle open.
+    squeezed.values[50 * 101 + 50 + 35] = f32::NAN;
+    let cut = squeezed.ridges(&ALL);
+    assert!(cut.iter().any(|line| line.first() != line.last()));
+}
+
+/// Distance of a point from a line.
+fn distance(point: [f64; 2], line: &[RidgePoint]) -> f64 {
+    let from = |pair: &[RidgePoint]| {
+        let (a, b) = (pair[0].place, pair[1].place);
+        let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+        let t = (((point[0] - a[0]) * dx + (point[1] - a[1]) * dy) / (dx * dx + dy * dy).max(1e-300)).clamp(0.0, 1.0);
+        (point[0] - a[0] - t * dx).hypot(point[1] - a[1] - t * dy)
+    };
+    line.windows(2).map(from).fold(f64::INFINITY, f64::min)
+}
+
+/// The double gyre on 201 x 101 nodes against 801 x 401.
+#[test]
+fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
+    let domain = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
+    let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TURN / 10.0 };
+    let velocity = VelocitySource::Analytic(flow, domain);
+    let map = FlowMap { precision: Precision::F64, ..FlowMap::tangent(10.0, 200) };
+    let ridges = |n: usize| {
+        let size = [2 * n + 1, n + 1];
+        let step = 1.0 / n as f64;
+        let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
+            .map(|k| DomainPoint([(step * (k % size[0]) as f64) as f32, (step * (k / size[0]) as f64) as f32, 0.5]))
+            .collect();
+        let values = stretches(&trace(&velocity, &map, 0.0, &seeds, Extras::default())).iter().map(|s| (s / 10.0) as f32).collect();
+        let strength = Strength { percentile: 80.0, length: 0.1 * n as f64, smoothing: 0.0 };
+        Field { origin: [0.0; 2], step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] }.ridges(&strength)
+    };
+    let (coarse, fine) = (ridges(100), ridges(400));
+    let mut distances: Vec<f64> =
+        coarse.iter().flatten().map(|p| fine.iter().map(|line| distance(p.place, line)).fold(f64::INFINITY, f64::min) * 100.0).collect();
+    distances.sort_by(f64::total_cmp);
+    let at = |share: f64| distances[((distances.len() - 1) as f64 * share) as usize];
+    println!(
+        "{} lines, {} points: median {:.4}, 90 % {:.3}, 95 % {:.3} coarse cells",
+        coarse.len(),
+        distances.len(),
+        at(0.5),
+        at(0.9),
+        at(0.95)
+    );
+    assert!(coarse.len() >= 3 && distances.len() > 300 && at(0.5) < 0.05, "median {}", at(0.5));
+}
