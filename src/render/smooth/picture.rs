@@ -9,6 +9,7 @@ use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, L
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
+use super::tone::ToneMap;
 use crate::renderer::RenderStats;
 use crate::rng::FrameRandom;
 use crate::tracking::FrameScene;
@@ -66,15 +67,6 @@ pub struct Picture {
     sums: Vec<PairSums>,
     pairs: u64,
     allocation: Allocation,
-}
-
-/// Squared slope of the tone map `[contrast, brightness, gamma]` at a radiance.
-pub fn squared_slope(tone_map: [f64; 3], radiance: f32) -> f32 {
-    let [contrast, brightness, gamma] = tone_map.map(|v| v as f32);
-    let value = (radiance - 0.5) * contrast + brightness;
-    // The map is constant where it saturates, and steep without bound at black; one 8-bit step bounds it.
-    let slope = contrast / gamma * value.max(1.0 / 255.0).powf(1.0 / gamma - 1.0);
-    if value <= 0.0 || value >= 1.0 { 0.0 } else { slope * slope }
 }
 
 impl Picture {
@@ -281,7 +273,8 @@ impl Picture {
 
     /// Sums of the squared errors of each tile.
     fn tile_sums(&self, scene: &Scene, film: &Film, combined: &Combined) -> Vec<TileSums> {
-        let squared_slope = |c: f32| squared_slope(scene.settings.tone_map, c);
+        let tone_map = ToneMap::new(scene.settings.tone_map);
+        let per_ray = 1.0 / self.march.rays as f32;
         let (width, height) = (film.width, film.height);
         let [across, down] = tiles(width, height);
         let of_tile = |tile: usize| {
@@ -295,9 +288,14 @@ impl Picture {
                 }
                 let pairs = self.sums[i].pairs() as f32;
                 let radiance: [f32; 3] = std::array::from_fn(|k| colour[k] * colour[k]);
+                let toned = combined.squared_in(Some(tone_map), i, &self.sums[i], self.base[i].radiance.map(|c| c * per_ray));
                 let mean = |e: [f32; 3], weight: &dyn Fn(f32) -> f32| (0..3).map(|k| e[k] * weight(colour[k])).sum::<f32>() / 3.0;
-                let weighted = |e: [f32; 3]| [mean(e, &|_| 1.0), mean(e, &|c| 1.0 / (c * c + 0.01)), mean(e, &squared_slope)];
-                let found = [squared, scatter, radiance].map(weighted);
+                let weighted = |e: [f32; 3], toned: f32| [mean(e, &|_| 1.0), mean(e, &|c| 1.0 / (c * c + 0.01)), toned];
+                let found = [
+                    weighted(squared, mean(toned[0], &|_| 1.0)),
+                    weighted(scatter, mean(toned[1], &|_| 1.0)),
+                    weighted(radiance, mean(radiance, &|c| tone_map.slope(c).powi(2))),
+                ];
                 let add = |errors: &mut TileErrors| {
                     for (sums, found) in [&mut errors.squared, &mut errors.scatter, &mut errors.radiance].into_iter().zip(found) {
                         (0..3).for_each(|weighting| sums[weighting] += found[weighting]);

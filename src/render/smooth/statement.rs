@@ -32,7 +32,7 @@ pub struct PictureError {
     pub rms: ErrorEstimate,
     /// Mean over lit pixels and channels of squared error / (radiance^2 + 0.01).
     pub relmse: ErrorEstimate,
-    /// PSNR of the tone-mapped picture over lit pixels, in decibels, to first order in the error.
+    /// PSNR of the tone-mapped picture over lit pixels, in decibels. First order in what is left of the error after the best correction.
     pub psnr: ErrorEstimate,
     /// The same over all pixels.
     pub psnr_all: ErrorEstimate,
@@ -44,7 +44,8 @@ pub struct PictureError {
     pub rays_per_pixel: u64,
 }
 
-/// Sums over pixels of a tile that have pairs. The index is the weight: none, 1 / (radiance^2 + 0.01), and the squared slope of the tone map.
+/// Sums over pixels of a tile that have pairs. The index is the weight: none, 1 / (radiance^2 + 0.01), and
+/// that of the tone map (see [`super::Combined::squared_in`]; of `radiance`: its squared slope).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct TileErrors {
