@@ -147,39 +147,47 @@ impl Picture {
             return 0.0;
         }
         let began = Instant::now();
-        let shift = round.sum;
         let refine = self.march.refine();
         let light = &*self.light.get_or_insert_with(|| LightVolume::new(medium, LIGHT_VALUES, refine));
         let step = medium.spacing() as f32 * self.march.step;
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
+        let marched = |pixel: u32, j: u64| match round.sum {
+            true => medium.mended_ray(pixel, j, step, light),
+            false => medium.ray(pixel, j, step, ToLight::Volume(light), false),
+        };
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
             if pixel % MARKED == 0 {
                 progress::mark();
             }
             for j in rays.clone().take_while(|_| !round.stop.load(Ordering::Relaxed)) {
-                sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(light), shift));
+                sum.add(&marched(pixel as u32, j));
             }
         });
         self.march.rays = rays.end;
-        let mean = |pixel: u32, rays: Range<u64>, step: f32, light: ToLight<'_>| {
+        let mean = |rays: Range<u64>, ray: &dyn Fn(u64) -> RaySum| {
             let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
-            rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
+            rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&ray(j)));
             progress::mark();
             (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
         };
-        let (volume, fine, shown) = (ToLight::Volume(light), step / AUDIT_STEPS as f32, self.march.audited_rays());
+        let (fine, shown) = (step / AUDIT_STEPS as f32, self.march.audited_rays());
         let look = |&pixel: &u32| {
-            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(pixel, rays, step, volume));
+            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(rays, &|j| marched(pixel, j)));
             let alpha = (alpha + more) / (shown + AUDIT_RAYS) as f64;
-            let [pair, fine] = [step, fine].map(|step| mean(pixel, 0..PAIR, step, volume).0);
+            if round.sum {
+                // What steps and light volume err, mended rays scatter.
+                return AuditedPixel { alpha, first, following, ..AuditedPixel::default() };
+            }
+            let [pair, fine] = [step, fine].map(|step| mean(0..PAIR, &|j| medium.ray(pixel, j, step, ToLight::Volume(light), false)).0);
             AuditedPixel { alpha, first, following, pair, fine, lit: None }
         };
         let mut compared: Vec<AuditedPixel> = audited.par_iter().map(look).collect();
         let mut lit: Vec<(&mut AuditedPixel, u32)> =
-            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit()).take(LIT_BY_MARCH).collect();
+            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit() && !round.sum).take(LIT_BY_MARCH).collect();
         lit.par_iter_mut().for_each(|(audited, pixel)| {
-            audited.lit = Some(mean(*pixel, 0..PAIR, fine, ToLight::March(step / LIGHT_STEPS as f32)).0);
+            let to_light = ToLight::March(step / LIGHT_STEPS as f32);
+            audited.lit = Some(mean(0..PAIR, &|j| medium.ray(*pixel, j, fine, to_light, false)).0);
         });
         compared.iter().for_each(|pixel| self.march.audit(pixel));
         began.elapsed().as_secs_f64()
@@ -264,7 +272,8 @@ impl Picture {
         let tiles = self.tile_sums(scene, &film, combined);
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let march = self.march.error();
-        let error = PictureError::of(&tiles, march, samples_per_pixel, self.march.rays);
+        let unbiased = how == Correction::Summed;
+        let error = PictureError { unbiased, ..PictureError::of(&tiles, march, samples_per_pixel, self.march.rays) };
         let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
         let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };
         film.error = smoothed(&mean, width, ERROR_RADIUS).into_iter().map(|e| (e.max(floor) + march as f32).sqrt()).collect();

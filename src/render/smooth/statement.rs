@@ -38,6 +38,8 @@ pub struct PictureError {
     pub psnr_all: ErrorEstimate,
     /// Root mean square of the error of marching alone, linear radiance. It is part of the errors above.
     pub march_rms: f64,
+    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"` on the CPU.
+    pub unbiased: bool,
     /// Coupled samples per pixel since the picture started anew.
     pub samples_per_pixel: f64,
     /// Marched rays per pixel since then.
@@ -141,6 +143,7 @@ impl PictureError {
             psnr: decibels(with_march(lit(2))),
             psnr_all: decibels(with_march(estimate(tiles.iter().map(|tile| &tile.all), 2))),
             march_rms: march.sqrt(),
+            unbiased: false,
             samples_per_pixel,
             rays_per_pixel,
         }
