@@ -170,7 +170,7 @@ enum Correction {
 struct Combine {
     const float* sums;    // planes as above
     const double* base;   // RAY_FIELDS planes of sums over rays
-    const float* halves;  // SHRUNK: 3 planes of each half
+    const float* halves;  // shrunk corrections, 3 planes of each half
     float* film;          // rgba of each pixel, then planes: mean FTLE, error, missing, samples
     float* squared;       // 2 planes: squared error, mean over the channels, and 1 where it is known, otherwise 0 and 0
     float* tiles;         // TILE_FIELDS a tile, rows of tiles from the top
@@ -191,13 +191,46 @@ constexpr int ERROR_FIELDS = 11, TILE_FIELDS = 2 * ERROR_FIELDS + 1;
 constexpr int TILE_STRIDE = TILE_PIXELS + 1, TILE_PARTS = 8;
 constexpr int TILE_MEMORY = TILE_FIELDS * (TILE_STRIDE + TILE_PARTS);
 
-// Square of the slope of the tone map.
-RW_FN float tone_weight(const Combine& c, float colour) {
-    const float value = (colour - 0.5f) * c.contrast + c.brightness;
+RW_FN float tone_value(const Combine& c, float colour) { return (colour - 0.5f) * c.contrast + c.brightness; }
+
+// Slope of the tone map.
+RW_FN float tone_slope(const Combine& c, float colour) {
+    const float value = tone_value(c, colour);
     if (value <= 0.0f || value >= 1.0f) return 0.0f;
     // Steep without bound at black; one 8-bit step bounds it.
-    const float slope = c.contrast / c.gamma * powf(max_(value, 1.0f / 255.0f), 1.0f / c.gamma - 1.0f);
-    return slope * slope;
+    return c.contrast / c.gamma * powf(max_(value, 1.0f / 255.0f), 1.0f / c.gamma - 1.0f);
+}
+
+// Slope of the tone map between two colours; at `at` where they are the same.
+RW_FN float tone_secant(const Combine& c, float at, float from) {
+    const float apart = at - from;
+    if (apart > -1e-3f && apart < 1e-3f) return tone_slope(c, at);
+    const float to = min_(max_(tone_value(c, at), 0.0f), 1.0f), begin = min_(max_(tone_value(c, from), 0.0f), 1.0f);
+    return (powf(to, 1.0f / c.gamma) - powf(begin, 1.0f / c.gamma)) / apart;
+}
+
+// One channel of a pixel: what is shown of both halves, their shrunk corrections, their means, and the halved differences between their quarters.
+struct Halves {
+    float shown[2], shrunk[2], mean[2], apart[2];
+};
+
+// Squared error of a channel and its scatter, with the slope k of the tone map between the shown colour and the best estimate, and t at the latter; 1 and 1
+// without a tone map. quarters: 0 if the pixel has both, otherwise the sign of the one that it has.
+RW_FN void squared_in(const Halves& h, int how, float k, float t, float quarters, float& squared, float& scatter) {
+    const float r = 0.5f * (h.shown[0] + h.shown[1]), g = 0.5f * (h.shrunk[0] + h.shrunk[1]), product = h.mean[0] * h.mean[1];
+    // g and r times the correction.
+    const float guessed = 0.5f * (h.shrunk[0] * h.mean[1] + h.shrunk[1] * h.mean[0]);
+    const float corrected = 0.5f * (h.shown[0] * h.mean[1] + h.shown[1] * h.mean[0]);
+    const float first = (r - g) * g + guessed - corrected, second = g * g - 2.0f * guessed + product;
+    squared = k * (r - g) * (k * (r - g)) + 2.0f * k * t * first + t * t * second;
+    if (quarters != 0.0f) {
+        scatter = quarters * (how == SUMMED ? k * k * product : squared);
+        return;
+    }
+    const float left = (h.mean[0] - h.shrunk[0]) * h.apart[1] + (h.mean[1] - h.shrunk[1]) * h.apart[0];
+    if (how == SUMMED) scatter = t * (t - k) * left + t * (2.0f * k - t) * h.apart[0] * h.apart[1];
+    else if (how == SHRUNK) scatter = t * t * left;
+    else scatter = t * t * left + t * k * (h.shrunk[0] * h.apart[1] + h.shrunk[1] * h.apart[0]);
 }
 
 // Writes a pixel of the film and its squared error. `fields`: what it adds to its tile, TILE_FIELDS values `stride` apart.
@@ -209,31 +242,27 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
     for (int k = 0; k < RAY_FIELDS; ++k) base[k] = c.base[k * pixels + at];
     float alpha = float(base[3] * c.per_ray);
     if (c.how == SUMMED) alpha += c.sums[PAIR_ALPHA * pixels + at] / (2.0f * most);
-    // Squared error, its scatter, and squared radiance.
-    float colour[3], found[3][3], difference = 0.0f;
+    // Squared error, its scatter, and squared radiance; the same in tone-mapped values.
+    float colour[3], found[3][3], toned[3][3], difference = 0.0f;
     const bool known = all > 0.0f, both = pairs[0] > 0.0f && pairs[1] > 0.0f, is_lit = alpha > c.lit;
+    const float quarters = both ? 0.0f : (pairs[0] > 0.0f ? 1.0f : -1.0f);
     for (int k = 0; k < 3; ++k) {
-        // Means of the halves, and halved differences between their quarters.
-        float mean[2], apart[2];
+        Halves h;
         for (int half = 0; half < 2; ++half) {
             const float first = c.sums[(6 * half + k) * pixels + at], second = c.sums[(6 * half + 3 + k) * pixels + at];
-            mean[half] = (first + second) / most;
-            apart[half] = 0.5f * (first / max_(pairs[0], 1.0f) - second / max_(pairs[1], 1.0f));
+            h.mean[half] = (first + second) / most;
+            h.apart[half] = 0.5f * (first / max_(pairs[0], 1.0f) - second / max_(pairs[1], 1.0f));
+            h.shrunk[half] = c.halves[(3 * half + k) * pixels + at];
+            h.shown[half] = c.how == SUMMED ? h.mean[half] : (c.how == SHRUNK ? h.shrunk[half] : 0.0f);
         }
-        float a = 0.0f, b = 0.0f;
-        if (c.how == SUMMED) a = mean[0], b = mean[1];
-        if (c.how == SHRUNK) a = c.halves[k * pixels + at], b = c.halves[(3 + k) * pixels + at];
-        const float r = 0.5f * (a + b), product = mean[0] * mean[1];
-        colour[k] = float(base[k] * c.per_ray) + r;
-        found[0][k] = r * r - (a * mean[1] + b * mean[0]) + product;
-        if (both) {
-            found[1][k] = c.how == SUMMED ? apart[0] * apart[1] : (mean[0] - a) * apart[1] + (mean[1] - b) * apart[0];
-        } else {
-            const float estimate = c.how == SUMMED ? product : found[0][k];
-            found[1][k] = pairs[0] > 0.0f ? estimate : -estimate;
-        }
+        const float marched = float(base[k] * c.per_ray), best = marched + 0.5f * (h.shrunk[0] + h.shrunk[1]);
+        colour[k] = marched + 0.5f * (h.shown[0] + h.shown[1]);
+        squared_in(h, c.how, 1.0f, 1.0f, quarters, found[0][k], found[1][k]);
+        squared_in(h, c.how, tone_secant(c, best, colour[k]), tone_slope(c, best), quarters, toned[0][k], toned[1][k]);
         found[2][k] = colour[k] * colour[k];
-        const float between = (mean[0] - mean[1]) * all;
+        const float slope = tone_slope(c, colour[k]);
+        toned[2][k] = found[2][k] * (slope * slope);
+        const float between = (h.mean[0] - h.mean[1]) * all;
         difference += between * between;
     }
     reinterpret_cast<Float4*>(c.film)[at] = {colour[0], colour[1], colour[2], alpha};
@@ -253,7 +282,7 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
             const float third = found[which][k] / 3.0f;
             sums[0] += third;
             sums[1] += third / (colour[k] * colour[k] + 0.01f);
-            sums[2] += third * tone_weight(c, colour[k]);
+            sums[2] += toned[which][k] / 3.0f;
         }
         for (int weighting = 0; weighting < 3; ++weighting) put(3 * which + weighting, sums[weighting]);
     }

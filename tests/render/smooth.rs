@@ -241,81 +241,99 @@ fn the_sum_of_march_and_correction_is_the_traced_picture() {
     }
 }
 
-/// Deviation of base plus mean correction from the truth: over the picture, over each tile of 16 x 16 pixels, and over the pixels in which `base` is most
-/// wrong. Each as a difference of luminance and its standard error, from the scatter between seeds.
-fn biases(base: &Film, corrections: &[Vec<f64>], truth: &Film) -> Vec<[f64; 2]> {
-    const TILE: usize = 16;
-    let luminance = |p: &[f32; 4]| f64::from(0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2]);
-    let missing: Vec<f64> = truth.rgba.iter().zip(&base.rgba).map(|(truth, base)| luminance(truth) - luminance(base)).collect();
-    let mut worst: Vec<usize> = (0..missing.len()).collect();
-    worst.sort_by(|&a, &b| missing[b].abs().total_cmp(&missing[a].abs()));
-    worst.truncate(missing.len() / 20);
-    let tile = |x: usize, y: usize| (0..TILE * TILE).map(|i| (y + i / TILE) * base.width + x + i % TILE).collect::<Vec<_>>();
-    let tiles = (0..base.height).step_by(TILE).flat_map(|y| (0..base.width).step_by(TILE).map(move |x| tile(x, y)));
-    let mean = |pixels: &[usize], values: &[f64]| pixels.iter().map(|&i| values[i]).sum::<f64>() / pixels.len() as f64;
-    let deviation = |pixels: Vec<usize>| {
-        let of_seeds: Vec<f64> = corrections.iter().map(|correction| mean(&pixels, correction) - mean(&pixels, &missing)).collect();
-        let n = of_seeds.len() as f64;
-        let bias = of_seeds.iter().sum::<f64>() / n;
-        [bias, (of_seeds.iter().map(|d| (d - bias).powi(2)).sum::<f64>() / (n - 1.0) / n).sqrt()]
-    };
-    [(0..missing.len()).collect(), worst].into_iter().chain(tiles).map(deviation).collect()
+fn luminances(film: &Film) -> Vec<f64> {
+    film.rgba.iter().map(|p| f64::from(0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2])).collect()
 }
 
-/// Whatever the surrogate: coupled samples correct its exact picture without a bias. Of another picture, or of a coarse march, they do not.
+/// Deviation of the mean of pictures from the truth: over the picture, over the twentieth of the pixels in which `surrogate` is most wrong, and over each
+/// tile of 16 x 16 pixels. Each as a difference of luminance and its standard error, from the scatter between pictures.
+fn biases(pictures: &[Vec<f64>], truth: &[f64], surrogate: &[f64], width: usize) -> Vec<[f64; 2]> {
+    const TILE: usize = 16;
+    let mut worst: Vec<usize> = (0..truth.len()).collect();
+    worst.sort_by(|&a, &b| (truth[b] - surrogate[b]).abs().total_cmp(&(truth[a] - surrogate[a]).abs()));
+    worst.truncate(truth.len() / 20);
+    let tile = |x: usize, y: usize| (0..TILE * TILE).map(|i| (y + i / TILE) * width + x + i % TILE).collect::<Vec<_>>();
+    let tiles = (0..truth.len() / width).step_by(TILE).flat_map(|y| (0..width).step_by(TILE).map(move |x| tile(x, y)));
+    let mean = |pixels: &[usize], values: &[f64]| pixels.iter().map(|&i| values[i]).sum::<f64>() / pixels.len() as f64;
+    let deviation = |pixels: Vec<usize>| {
+        let of_pictures: Vec<f64> = pictures.iter().map(|picture| mean(&pixels, picture) - mean(&pixels, truth)).collect();
+        let n = of_pictures.len() as f64;
+        let bias = of_pictures.iter().sum::<f64>() / n;
+        [bias, (of_pictures.iter().map(|d| (d - bias).powi(2)).sum::<f64>() / (n - 1.0) / n).sqrt()]
+    };
+    [(0..truth.len()).collect(), worst].into_iter().chain(tiles).map(deviation).collect()
+}
+
+/// Whatever the surrogate, and however coarse the march: the mean of `combine = "sum"` is the picture of the traced field. Coupled to another surrogate, or
+/// on a march that is not mended, it is not.
 #[test]
 fn corrections_of_any_surrogate_are_unbiased() {
+    const WIDTH: usize = 32;
     const SEEDS: u64 = 64;
-    const SAMPLES: u32 = 16;
-    /// Two-sided quantile of Student's t with 63 degrees of freedom at 1 %, over all 24 comparisons (Bonferroni).
-    const LIMIT: f64 = 3.75;
+    const SAMPLES: f64 = 16.0;
+    /// Two-sided quantile of Student's t with 63 degrees of freedom at 1 %, over all 30 comparisons (Bonferroni).
+    const LIMIT: f64 = 3.81;
     let domain = cube();
-    let scene = scene(&domain, 32, false, oblique());
+    let scene = scene(&domain, WIDTH, false, oblique());
     let traced = nodes(&domain, [33; 3], field);
     let converged_of = |nodes: &Nodes| {
         let renderer = Renderer::new(scene.clone(), &domain, TAU).unwrap();
-        converged(&Medium { scene: &renderer.frame_scene(0), nodes, missing: None })
+        luminances(&converged(&Medium { scene: &renderer.frame_scene(0), nodes, missing: None }))
     };
     let truth = converged_of(&traced);
-    let paths: Vec<(u32, u32)> = (0..32 * 32).flat_map(|pixel| (0..SAMPLES).map(move |sample| (pixel, sample))).collect();
-    let corrections = |surrogate: &Nodes| -> Vec<Vec<f64>> {
-        let of_seed = |seed: u64| {
-            let mut renderer = Renderer::new(Scene { seed: 1000 + seed, ..scene.clone() }, &domain, TAU).unwrap();
-            let mut answers = Traced(|p: DomainPoint| traced.at(domain.to_unit(p)));
-            let found = renderer.coupled_paths(0, surrogate, None, &paths, &mut answers);
-            let luminance = |[r, g, b]: [f32; 3]| f64::from(0.2126 * r + 0.7152 * g + 0.0722 * b);
-            found
-                .chunks(SAMPLES as usize)
-                .map(|pixel| pixel.iter().map(|path| luminance(path.radiance)).sum::<f64>() / f64::from(SAMPLES))
-                .collect()
-        };
-        (0..SEEDS).map(of_seed).collect()
-    };
     let beyond = |found: &[[f64; 2]]| found.iter().filter(|[bias, error]| bias.abs() > LIMIT * error).count();
+    let moved = |pictures: &[Vec<f64>], from: &[f64], to: &[f64]| -> Vec<Vec<f64>> {
+        pictures.iter().map(|picture| (0..picture.len()).map(|i| picture[i] - from[i] + to[i]).collect()).collect()
+    };
     let ridge = |p: DomainPoint| field(p) + 0.8 * (-((p.0[0] - 0.53) / 0.03).powi(2)).exp();
     let surrogates: [(&str, &dyn Fn(DomainPoint) -> f32); 4] =
         [("good", &nearby), ("untrained", &|_| 1.0), ("off by a constant", &|p| field(p) + 0.3), ("wrong in a thin ridge", &ridge)];
     for (what, of) in surrogates {
         let surrogate = nodes(&domain, [33; 3], of);
-        let (base, corrections) = (converged_of(&surrogate), corrections(&surrogate));
-        let found = biases(&base, &corrections, &truth);
+        let base = converged_of(&surrogate);
+        let picture = |seed: u64| {
+            let mut smooth = Smooth::new(&Scene { seed: 1000 + seed, ..scene.clone() }, &domain);
+            let round = (Method::TwoLevel, true, SAMPLES);
+            luminances(&smooth.round(&surrogate, None, round, |p: DomainPoint| traced.at(domain.to_unit(p))).0)
+        };
+        let pictures: Vec<Vec<f64>> = (0..SEEDS).map(picture).collect();
+        let found = biases(&pictures, &truth, &base, WIDTH);
         assert_eq!(beyond(&found), 0, "{what}: {found:?}");
         let [_, error] = found[0];
         assert!(LIMIT * error < 1e-3, "{what}: a bias of the picture's mean below -60 dB shows, not only one of {:.1e}", LIMIT * error);
         // Coupled to another surrogate than the one that is shown.
-        let other = nodes(&domain, [33; 3], |p| of(p) + 0.02);
-        assert!(beyond(&biases(&converged_of(&other), &corrections, &truth)) > 0, "{what}: a broken coupling is not noticed");
+        let other = converged_of(&nodes(&domain, [33; 3], |p| of(p) + 0.02));
+        let broken = biases(&moved(&pictures, &base, &other), &truth, &base, WIDTH);
+        assert!(beyond(&broken) > 0, "{what}: a broken coupling is not noticed");
     }
+    // The base alone, with steps and a light volume that are too coarse: mended, and as marched.
     let surrogate = nodes(&domain, [33; 3], nearby);
-    let renderer = Renderer::new(scene.clone(), &domain, TAU).unwrap();
-    let (frame, mut coarse) = (renderer.frame_scene(0), Film::new(32, 32));
-    let medium = Medium { scene: &frame, nodes: &surrogate, missing: None };
-    let volume = LightVolume::new(&medium, 1 << 24, 4);
-    for (pixel, rgba) in coarse.rgba.iter_mut().enumerate() {
-        let ray = medium.ray(pixel as u32, 0, 4.0 * medium.spacing() as f32, ToLight::Volume(&volume), false);
-        *rgba = [ray.radiance[0], ray.radiance[1], ray.radiance[2], ray.alpha];
-    }
-    assert!(beyond(&biases(&coarse, &corrections(&surrogate), &truth)) > 0, "a coarse march is not noticed");
+    let expected = converged_of(&surrogate);
+    let based = |mended: bool| {
+        let of_seed = |seed: u64| {
+            let renderer = Renderer::new(Scene { seed: 1000 + seed, ..scene.clone() }, &domain, TAU).unwrap();
+            let frame = renderer.frame_scene(0);
+            let medium = Medium { scene: &frame, nodes: &surrogate, missing: None };
+            let (volume, step) = (LightVolume::new(&medium, 1 << 12, 1), 4.0 * medium.spacing() as f32);
+            let mut film = Film::new(WIDTH, WIDTH);
+            for (pixel, rgba) in film.rgba.iter_mut().enumerate() {
+                let mut sum = RaySum::default();
+                (0..16).for_each(|j| {
+                    sum.add(&match mended {
+                        true => medium.mended_ray(pixel as u32, j, step, &volume),
+                        false => medium.ray(pixel as u32, j, step, ToLight::Volume(&volume), true),
+                    });
+                });
+                let [red, green, blue] = sum.radiance;
+                *rgba = [red, green, blue, sum.alpha].map(|c| c / 16.0);
+            }
+            luminances(&film)
+        };
+        biases(&(0..SEEDS).map(of_seed).collect::<Vec<_>>(), &expected, &truth, WIDTH)
+    };
+    let (mended, marched) = (based(true), based(false));
+    assert!(beyond(&mended) == 0 && LIMIT * mended[0][1] < 1e-3, "{mended:?}");
+    assert!(beyond(&marched) > 0, "a coarse march is not noticed: {marched:?}");
 }
 
 /// Mean square error over lit pixels and channels, with the noise of the truth removed by the product of two halves.

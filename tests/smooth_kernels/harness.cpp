@@ -157,7 +157,7 @@ int main(int, char** arguments) {
                 }
             }
         };
-        for (int half = 0; half < 2 && c.how == SHRUNK; ++half) {
+        for (int half = 0; half < 2; ++half) {
             Quarters fine = {}, filtered = {};
             for (int q = 0; q < 2; ++q) {
                 for (int k = 0; k < 4; ++k) {

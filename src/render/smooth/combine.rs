@@ -7,6 +7,7 @@
 //! with d_A and d_B the means of the halves at a pixel, r = (a + b) / 2 the correction shown and c its expectation,
 //! r^2 - (a d_B + b d_A) + d_A d_B is an unbiased estimate of (r - c)^2. As samples come, gains go to 1 wherever there is anything to correct.
 
+use super::tone::ToneMap;
 use rayon::prelude::*;
 
 /// Scales of the transform.
@@ -193,49 +194,83 @@ pub struct Combined {
     /// quarters, at least as large on average. The product is in d_A and d_B already, except where the sum is shown, a = d_A. In a pixel with one
     /// quarter it is the estimate itself (for a sum d_A d_B), with the sign of the quarter, so that a tile's sum is the difference between its quarters.
     pub squared: Vec<[[f32; 3]; 2]>,
+    /// Corrections of the halves, each shrunk by itself.
+    shrunk: [Vec<[f32; 3]>; 2],
+    how: Correction,
 }
 
 /// The correction of `sums` (row by row, `width` pixels each) and its squared error, from the products of differences between halves.
 pub fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
-    let halves: [Vec<[f32; 3]>; 2] = std::array::from_fn(|half| match how {
-        Correction::Left => vec![[0.0; 3]; sums.len()],
-        Correction::Summed => sums.par_iter().map(|sums| sums.half(half)).collect(),
-        Correction::Shrunk => {
-            let quarter = |quarter: usize| -> Vec<Weighted> {
-                let weighted = |sums: &PairSums| {
-                    let [r, g, b] = sums.radiance[half][quarter];
-                    [r, g, b, sums.pairs[quarter] as f32]
-                };
-                sums.par_iter().map(weighted).collect()
+    let shrunk = [0, 1].map(|half| {
+        let quarter = |quarter: usize| -> Vec<Weighted> {
+            let weighted = |sums: &PairSums| {
+                let [r, g, b] = sums.radiance[half][quarter];
+                [r, g, b, sums.pairs[quarter] as f32]
             };
-            shrunk([quarter(0), quarter(1)], width)
-        }
+            sums.par_iter().map(weighted).collect()
+        };
+        shrunk([quarter(0), quarter(1)], width)
     });
-    let [a, b] = &halves;
-    let correction: Vec<[f32; 3]> = a.par_iter().zip(b).map(|(a, b)| std::array::from_fn(|k| 0.5 * (a[k] + b[k]))).collect();
-    let squared = (0..sums.len())
-        .into_par_iter()
-        .with_min_len(1 << 10)
-        .map(|i| {
-            let (sums, a, b, r) = (&sums[i], a[i], b[i], correction[i]);
-            if sums.pairs() == 0 {
-                return [[f32::NAN; 3]; 2];
-            }
-            let [d_a, d_b] = [sums.half(0), sums.half(1)];
-            let apart = |half: usize, k: usize| 0.5 * (sums.quarter(half, 0)[k] - sums.quarter(half, 1)[k]);
-            let squared = std::array::from_fn(|k| r[k] * r[k] - (a[k] * d_b[k] + b[k] * d_a[k]) + d_a[k] * d_b[k]);
-            let scatter = std::array::from_fn(|k| {
-                if sums.pairs.contains(&0) {
-                    let estimate = if how == Correction::Summed { d_a[k] * d_b[k] } else { squared[k] };
-                    return if sums.pairs[0] > 0 { estimate } else { -estimate };
+    let mut combined = Combined { correction: Vec::new(), squared: Vec::new(), shrunk, how };
+    let at = |i: usize| {
+        let [a, b] = combined.shown(i, &sums[i]);
+        (std::array::from_fn(|k| 0.5 * (a[k] + b[k])), combined.squared_in(None, i, &sums[i], [0.0; 3]))
+    };
+    (combined.correction, combined.squared) = (0..sums.len()).into_par_iter().with_min_len(1 << 10).map(at).unzip();
+    combined
+}
+
+impl Combined {
+    /// Corrections of the halves, of which the mean is shown.
+    fn shown(&self, pixel: usize, sums: &PairSums) -> [[f32; 3]; 2] {
+        match self.how {
+            Correction::Left => [[0.0; 3]; 2],
+            Correction::Shrunk => [0, 1].map(|half: usize| self.shrunk[half][pixel]),
+            Correction::Summed => [0, 1].map(|half| sums.half(half)),
+        }
+    }
+
+    /// The squared error of a pixel and its scatter, as in [`Self::squared`], in tone-mapped values if there is a tone map. `base`: its marched radiance.
+    ///
+    /// The tone map T takes the shown radiance s to that of the best estimate p = base + g exactly, with g = (a + b) / 2 of the shrunk halves, and on to the
+    /// truth y to first order: T(s) - T(y) = k (s - p) + t (p - y), where k is the slope between s and p and t that at p. In its square, products with
+    /// the unknown correction are those of a half and the mean of the other.
+    pub fn squared_in(&self, tone_map: Option<ToneMap>, pixel: usize, sums: &PairSums, base: [f32; 3]) -> [[f32; 3]; 2] {
+        if sums.pairs() == 0 {
+            return [[f32::NAN; 3]; 2];
+        }
+        let [a, b] = [0, 1].map(|half: usize| self.shrunk[half][pixel]);
+        let ([shown_a, shown_b], [d_a, d_b]) = (self.shown(pixel, sums), [0, 1].map(|half| sums.half(half)));
+        let mut found = [[0.0; 3]; 2];
+        for channel in 0..3 {
+            let of = |colour: [f32; 3]| colour[channel];
+            let (a, b, d_a, d_b) = (of(a), of(b), of(d_a), of(d_b));
+            let (r, g, product) = (0.5 * (of(shown_a) + of(shown_b)), 0.5 * (a + b), d_a * d_b);
+            let (p, s) = (of(base) + g, of(base) + r);
+            let (k, t) = tone_map.map_or((1.0, 1.0), |tone_map| (tone_map.secant(p, s), tone_map.slope(p)));
+            // r and g times the correction.
+            let guessed = 0.5 * (a * d_b + b * d_a);
+            let corrected = 0.5 * (of(shown_a) * d_b + of(shown_b) * d_a);
+            let (first, second) = ((r - g) * g + guessed - corrected, g * g - 2.0 * guessed + product);
+            let squared = (k * (r - g)).powi(2) + 2.0 * k * t * first + t * t * second;
+            let scatter = if sums.pairs.contains(&0) {
+                let estimate = if self.how == Correction::Summed { k * k * product } else { squared };
+                if sums.pairs[0] > 0 { estimate } else { -estimate }
+            } else {
+                let apart = |half: usize| 0.5 * (of(sums.quarter(half, 0)) - of(sums.quarter(half, 1)));
+                let (e_a, e_b) = (apart(0), apart(1));
+                // What the estimate loses or gains with e_A and e_B.
+                let left = (d_a - a) * e_b + (d_b - b) * e_a;
+                match self.how {
+                    Correction::Summed => t * (t - k) * left + t * (2.0 * k - t) * e_a * e_b,
+                    Correction::Shrunk => t * t * left,
+                    Correction::Left => t * t * left + t * k * (a * e_b + b * e_a),
                 }
-                let (e_a, e_b) = (apart(0, k), apart(1, k));
-                if how == Correction::Summed { e_a * e_b } else { (d_a[k] - a[k]) * e_b + (d_b[k] - b[k]) * e_a }
-            });
-            [squared, scatter]
-        })
-        .collect();
-    Combined { correction, squared }
+            };
+            (found[0][channel], found[1][channel]) = (squared, scatter);
+        }
+        found
+    }
 }
 
 /// Mean of the known values over a square around each pixel; NaN where none is known.

@@ -15,6 +15,7 @@ mod medium;
 mod nodes;
 mod picture;
 mod statement;
+mod tone;
 
 pub use allocation::bayer_rank;
 pub use combine::{Combined, Correction, PairSums, combine, smoothed};
@@ -28,6 +29,7 @@ pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},
     march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, PAIR},
-    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS, squared_slope},
+    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
     statement::LIT,
+    tone::{ToneMap, squared_slope},
 };

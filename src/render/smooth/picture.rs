@@ -9,6 +9,7 @@ use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, L
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
+use super::tone::ToneMap;
 use crate::renderer::RenderStats;
 use crate::rng::FrameRandom;
 use crate::tracking::FrameScene;
@@ -66,15 +67,6 @@ pub struct Picture {
     sums: Vec<PairSums>,
     pairs: u64,
     allocation: Allocation,
-}
-
-/// Squared slope of the tone map `[contrast, brightness, gamma]` at a radiance.
-pub fn squared_slope(tone_map: [f64; 3], radiance: f32) -> f32 {
-    let [contrast, brightness, gamma] = tone_map.map(|v| v as f32);
-    let value = (radiance - 0.5) * contrast + brightness;
-    // The map is constant where it saturates, and steep without bound at black; one 8-bit step bounds it.
-    let slope = contrast / gamma * value.max(1.0 / 255.0).powf(1.0 / gamma - 1.0);
-    if value <= 0.0 || value >= 1.0 { 0.0 } else { slope * slope }
 }
 
 impl Picture {
@@ -155,39 +147,47 @@ impl Picture {
             return 0.0;
         }
         let began = Instant::now();
-        let shift = round.sum;
         let refine = self.march.refine();
         let light = &*self.light.get_or_insert_with(|| LightVolume::new(medium, LIGHT_VALUES, refine));
         let step = medium.spacing() as f32 * self.march.step;
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
+        let marched = |pixel: u32, j: u64| match round.sum {
+            true => medium.mended_ray(pixel, j, step, light),
+            false => medium.ray(pixel, j, step, ToLight::Volume(light), false),
+        };
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
             if pixel % MARKED == 0 {
                 progress::mark();
             }
             for j in rays.clone().take_while(|_| !round.stop.load(Ordering::Relaxed)) {
-                sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(light), shift));
+                sum.add(&marched(pixel as u32, j));
             }
         });
         self.march.rays = rays.end;
-        let mean = |pixel: u32, rays: Range<u64>, step: f32, light: ToLight<'_>| {
+        let mean = |rays: Range<u64>, ray: &dyn Fn(u64) -> RaySum| {
             let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
-            rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
+            rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&ray(j)));
             progress::mark();
             (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
         };
-        let (volume, fine, shown) = (ToLight::Volume(light), step / AUDIT_STEPS as f32, self.march.audited_rays());
+        let (fine, shown) = (step / AUDIT_STEPS as f32, self.march.audited_rays());
         let look = |&pixel: &u32| {
-            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(pixel, rays, step, volume));
+            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(rays, &|j| marched(pixel, j)));
             let alpha = (alpha + more) / (shown + AUDIT_RAYS) as f64;
-            let [pair, fine] = [step, fine].map(|step| mean(pixel, 0..PAIR, step, volume).0);
+            if round.sum {
+                // What steps and light volume err, mended rays scatter.
+                return AuditedPixel { alpha, first, following, ..AuditedPixel::default() };
+            }
+            let [pair, fine] = [step, fine].map(|step| mean(0..PAIR, &|j| medium.ray(pixel, j, step, ToLight::Volume(light), false)).0);
             AuditedPixel { alpha, first, following, pair, fine, lit: None }
         };
         let mut compared: Vec<AuditedPixel> = audited.par_iter().map(look).collect();
         let mut lit: Vec<(&mut AuditedPixel, u32)> =
-            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit()).take(LIT_BY_MARCH).collect();
+            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit() && !round.sum).take(LIT_BY_MARCH).collect();
         lit.par_iter_mut().for_each(|(audited, pixel)| {
-            audited.lit = Some(mean(*pixel, 0..PAIR, fine, ToLight::March(step / LIGHT_STEPS as f32)).0);
+            let to_light = ToLight::March(step / LIGHT_STEPS as f32);
+            audited.lit = Some(mean(0..PAIR, &|j| medium.ray(*pixel, j, fine, to_light, false)).0);
         });
         compared.iter().for_each(|pixel| self.march.audit(pixel));
         began.elapsed().as_secs_f64()
@@ -272,7 +272,8 @@ impl Picture {
         let tiles = self.tile_sums(scene, &film, combined);
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let march = self.march.error();
-        let error = PictureError::of(&tiles, march, samples_per_pixel, self.march.rays);
+        let unbiased = how == Correction::Summed;
+        let error = PictureError { unbiased, ..PictureError::of(&tiles, march, samples_per_pixel, self.march.rays) };
         let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
         let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };
         film.error = smoothed(&mean, width, ERROR_RADIUS).into_iter().map(|e| (e.max(floor) + march as f32).sqrt()).collect();
@@ -281,7 +282,8 @@ impl Picture {
 
     /// Sums of the squared errors of each tile.
     fn tile_sums(&self, scene: &Scene, film: &Film, combined: &Combined) -> Vec<TileSums> {
-        let squared_slope = |c: f32| squared_slope(scene.settings.tone_map, c);
+        let tone_map = ToneMap::new(scene.settings.tone_map);
+        let per_ray = 1.0 / self.march.rays as f32;
         let (width, height) = (film.width, film.height);
         let [across, down] = tiles(width, height);
         let of_tile = |tile: usize| {
@@ -295,9 +297,14 @@ impl Picture {
                 }
                 let pairs = self.sums[i].pairs() as f32;
                 let radiance: [f32; 3] = std::array::from_fn(|k| colour[k] * colour[k]);
+                let toned = combined.squared_in(Some(tone_map), i, &self.sums[i], self.base[i].radiance.map(|c| c * per_ray));
                 let mean = |e: [f32; 3], weight: &dyn Fn(f32) -> f32| (0..3).map(|k| e[k] * weight(colour[k])).sum::<f32>() / 3.0;
-                let weighted = |e: [f32; 3]| [mean(e, &|_| 1.0), mean(e, &|c| 1.0 / (c * c + 0.01)), mean(e, &squared_slope)];
-                let found = [squared, scatter, radiance].map(weighted);
+                let weighted = |e: [f32; 3], toned: f32| [mean(e, &|_| 1.0), mean(e, &|c| 1.0 / (c * c + 0.01)), toned];
+                let found = [
+                    weighted(squared, mean(toned[0], &|_| 1.0)),
+                    weighted(scatter, mean(toned[1], &|_| 1.0)),
+                    weighted(radiance, mean(radiance, &|c| tone_map.slope(c).powi(2))),
+                ];
                 let add = |errors: &mut TileErrors| {
                     for (sums, found) in [&mut errors.squared, &mut errors.scatter, &mut errors.radiance].into_iter().zip(found) {
                         (0..3).for_each(|weighting| sums[weighting] += found[weighting]);

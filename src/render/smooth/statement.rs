@@ -32,19 +32,22 @@ pub struct PictureError {
     pub rms: ErrorEstimate,
     /// Mean over lit pixels and channels of squared error / (radiance^2 + 0.01).
     pub relmse: ErrorEstimate,
-    /// PSNR of the tone-mapped picture over lit pixels, in decibels, to first order in the error.
+    /// PSNR of the tone-mapped picture over lit pixels, in decibels. First order in what is left of the error after the best correction.
     pub psnr: ErrorEstimate,
     /// The same over all pixels.
     pub psnr_all: ErrorEstimate,
     /// Root mean square of the error of marching alone, linear radiance. It is part of the errors above.
     pub march_rms: f64,
+    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"` on the CPU.
+    pub unbiased: bool,
     /// Coupled samples per pixel since the picture started anew.
     pub samples_per_pixel: f64,
     /// Marched rays per pixel since then.
     pub rays_per_pixel: u64,
 }
 
-/// Sums over pixels of a tile that have pairs. The index is the weight: none, 1 / (radiance^2 + 0.01), and the squared slope of the tone map.
+/// Sums over pixels of a tile that have pairs. The index is the weight: none, 1 / (radiance^2 + 0.01), and
+/// that of the tone map (see [`super::Combined::squared_in`]; of `radiance`: its squared slope).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 pub struct TileErrors {
@@ -140,6 +143,7 @@ impl PictureError {
             psnr: decibels(with_march(lit(2))),
             psnr_all: decibels(with_march(estimate(tiles.iter().map(|tile| &tile.all), 2))),
             march_rms: march.sqrt(),
+            unbiased: false,
             samples_per_pixel,
             rays_per_pixel,
         }

@@ -183,10 +183,9 @@ impl GpuCombine {
         let gpu = self.gpu.clone();
         let at = room(&gpu, &mut self.planes, "combining pictures", PLANES.count * pixels)?.address();
         let plane = |number: usize| at + (number * pixels * size_of::<f32>()) as u64;
-        if input.how == Some(Combination::Shrink) {
-            for half in 0..2 {
-                self.shrink(input, half, plane)?;
-            }
+        // Whatever is shown: the error in tone-mapped values is that of the best estimate, and its way to the picture.
+        for half in 0..2 {
+            self.shrink(input, half, plane)?;
         }
         let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];
         let count = tiles[0] * tiles[1] * TILE_FIELDS;

@@ -6,7 +6,7 @@ use super::march::LightArgument;
 use crate::cuda::SUM_PLANES;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_render::rng::philox;
-use ridgewatch_render::smooth::{Correction, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, combine, smoothed};
+use ridgewatch_render::smooth::{Correction, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, ToneMap, combine, smoothed};
 use ridgewatch_render::{CameraSettings, Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -475,23 +475,20 @@ fn combined_pictures_agree() {
                 let expected = (errors[i].max(floor) + added).sqrt();
                 assert!(same(error[i], expected, 0.3), "{what}, pixel {i}: {} and {expected}", error[i]);
                 let tile = &mut expected_tiles[i / width / 16 * width.div_ceil(16) + i % width / 16];
-                let slope = |c: f32| {
-                    let value = (c - 0.5) * contrast + brightness;
-                    let steep = f64::from(contrast / gamma) * f64::from(value.max(1.0 / 255.0)).powf(1.0 / f64::from(gamma) - 1.0);
-                    if value <= 0.0 || value >= 1.0 { 0.0 } else { steep }
-                };
-                let weight = |weighting: usize, c: f32| match weighting {
-                    0 => 1.0,
-                    1 => 1.0 / (f64::from(c).powi(2) + 0.01),
-                    _ => slope(c).powi(2),
-                };
+                let tone_map = ToneMap::new([contrast, brightness, gamma].map(f64::from));
                 let [squared, scatter] = combined.squared[i];
-                let radiance = std::array::from_fn(|k| rgba[i][k].powi(2));
+                let radiance: [f32; 3] = std::array::from_fn(|k| rgba[i][k].powi(2));
+                let marched = std::array::from_fn(|k| (b[k] / rays) as f32);
+                let [toned, toned_scatter] = combined.squared_in(Some(tone_map), i, s, marched);
+                let toned_radiance = std::array::from_fn(|k| radiance[k] * tone_map.slope(rgba[i][k]).powi(2));
                 for group in 0..(1 + usize::from(alpha > lit)) * usize::from(s.pairs() > 0) {
-                    for (which, e) in [squared, scatter, radiance].iter().enumerate() {
-                        for weighting in 0..3 {
-                            let sum: f64 = (0..3).map(|k| f64::from(e[k]) * weight(weighting, rgba[i][k])).sum();
-                            tile[11 * group + 3 * which + weighting] += sum / 3.0;
+                    let pairs = [(squared, toned), (scatter, toned_scatter), (radiance, toned_radiance)];
+                    for (which, (e, toned)) in pairs.into_iter().enumerate() {
+                        for k in 0..3 {
+                            let relative = e[k] / (rgba[i][k].powi(2) + 0.01);
+                            for (weighting, value) in [e[k], relative, toned[k]].into_iter().enumerate() {
+                                tile[11 * group + 3 * which + weighting] += f64::from(value) / 3.0;
+                            }
                         }
                     }
                     tile[11 * group + 9] += 1.0;
