@@ -3,7 +3,8 @@
 //!
 //! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [table.key=value]`: frames a slide; a method of smooth frames or `reference`, with
 //! samples per pixel and frame of its own if given. The truth is the mean of two halves of `reference`; the product of the differences to the halves is
-//! the squared error without their noise; its samples bound the decibels that are told (a thousand resolve some 45). The first slide, which compiles kernels, is not counted. The source needs six slides.
+//! the squared error without their noise, up to a bound that their samples set. The first slide, which compiles kernels, is not counted. The source needs
+//! six slides.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
