@@ -224,7 +224,7 @@ RW_FN void squared_in(const Halves& h, int how, float k, float t, float quarters
     const float first = (r - g) * g + guessed - corrected, second = g * g - 2.0f * guessed + product;
     squared = k * (r - g) * (k * (r - g)) + 2.0f * k * t * first + t * t * second;
     if (quarters != 0.0f) {
-        scatter = quarters * (how == SUMMED ? k * k * product : squared);
+        scatter = quarters * (how == SUMMED ? t * (t - k) * second - t * k * product : squared);
         return;
     }
     const float left = (h.mean[0] - h.shrunk[0]) * h.apart[1] + (h.mean[1] - h.shrunk[1]) * h.apart[0];

@@ -66,7 +66,7 @@ struct March {
     float step;          // longest step, scene units
     uint32_t first_ray;  // rays of a pixel before this pass
     uint32_t rays;       // rays of a pixel in this pass
-    int shifted;         // 1: a random shift for each pixel makes the rays unbiased
+    int shifted;         // 1: a random shift for each pixel makes the places of rays and points unbiased; rays go on to their end
 };
 static_assert(sizeof(March) == 248, "layout");
 
@@ -461,7 +461,8 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
     const LightLine lit = light_line(march.light, ray.line);
     float transmittance = 1.0f;
     int i = 0, in_missing = 0;
-    while (i < ray.points && transmittance >= OPAQUE) {
+    const float opaque = march.shifted ? 0.0f : OPAQUE;
+    while (i < ray.points && transmittance >= opaque) {
         // The points before `stop` share a brick. Neighbouring rays then look up bricks together.
         int stop = ray.points;
         if (march.bricks.usable) {
@@ -475,7 +476,7 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
                 continue;
             }
         }
-        for (; i < stop && transmittance >= OPAQUE; ++i) {
+        for (; i < stop && transmittance >= opaque; ++i) {
             const float t = (float(i) + ray.offset) * ray.step;
             float at[3], ftle;
             for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
@@ -517,7 +518,8 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
         found[3] = 0.0f;
     });
     if (!hit) return;
-    for (int first = 0; first < ray.points && state[0] >= OPAQUE; first += CHECK_POINTS) {
+    const float opaque = march.shifted ? 0.0f : OPAQUE;
+    for (int first = 0; first < ray.points && state[0] >= opaque; first += CHECK_POINTS) {
         const int count = min_(ray.points - first, CHECK_POINTS);
         block.each(count, [&](int i) {
             const float t = (float(first + i) + ray.offset) * ray.step;
@@ -543,7 +545,7 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
         });
         block.each(1, [&](int) {
             float transmittance = state[0];
-            for (int i = 0; i < count && transmittance >= OPAQUE; ++i) {
+            for (int i = 0; i < count && transmittance >= opaque; ++i) {
                 state[2] += 1.0f;
                 if (absorbed[i] < 0.0f) {
                     state[1] += 1.0f;

@@ -192,7 +192,7 @@ pub struct Combined {
     /// With e_A and e_B the noise of d_A and d_B, the estimate is wrong by (c - a) e_B + (c - b) e_A + e_A e_B. Halved differences between the quarters
     /// are noise of the same variance; with them in place of e_A and e_B and d_A, d_B in place of c this is the scatter of a pixel that has both
     /// quarters, at least as large on average. The product is in d_A and d_B already, except where the sum is shown, a = d_A. In a pixel with one
-    /// quarter it is the estimate itself (for a sum d_A d_B), with the sign of the quarter, so that a tile's sum is the difference between its quarters.
+    /// quarter it is the estimate itself (for a sum its part that has noise, of the size of d_A d_B), with the sign of the quarter, so that a tile's sum is the difference between its quarters.
     pub squared: Vec<[[f32; 3]; 2]>,
     /// Corrections of the halves, each shrunk by itself.
     shrunk: [Vec<[f32; 3]>; 2],
@@ -254,7 +254,7 @@ impl Combined {
             let (first, second) = ((r - g) * g + guessed - corrected, g * g - 2.0 * guessed + product);
             let squared = (k * (r - g)).powi(2) + 2.0 * k * t * first + t * t * second;
             let scatter = if sums.pairs.contains(&0) {
-                let estimate = if self.how == Correction::Summed { k * k * product } else { squared };
+                let estimate = if self.how == Correction::Summed { t * (t - k) * second - t * k * product } else { squared };
                 if sums.pairs[0] > 0 { estimate } else { -estimate }
             } else {
                 let apart = |half: usize| 0.5 * (of(sums.quarter(half, 0)) - of(sums.quarter(half, 1)));
@@ -348,6 +348,27 @@ mod tests {
         let error = mean_square(combine(&sums, 128, Correction::Shrunk).correction.iter().map(|r| r[0]));
         // The plain mean has 0.25 / 8, of which less than a twentieth may stay.
         assert!(error < 0.05 * 0.25 / 8.0, "{error}");
+    }
+
+    #[test]
+    fn the_stated_tone_mapped_error_is_that_of_the_picture_shown() {
+        let (width, height, base) = (256, 192, 0.3);
+        let detail = |i: usize| 0.04 * (unit(philox([i as u32, 0, 0, 0], [7, 2])[0]) - 0.5);
+        let truth: Vec<f32> = bump(width, height).iter().enumerate().map(|(i, bump)| bump + detail(i)).collect();
+        let map = ToneMap::new([1.85, 0.75, 1.4]);
+        let mapped = |c: f32| ((c - 0.5) * 1.85 + 0.75).clamp(0.0, 1.0).powf(1.0 / 1.4);
+        for how in [Correction::Left, Correction::Shrunk, Correction::Summed] {
+            let (mut stated, mut found) = (0.0, 0.0);
+            for seed in 0..8 {
+                let sums = sampled(&truth, 0.05, 8, 200 + seed);
+                let combined = combine(&sums, width, how);
+                let squared = |i: usize| f64::from(combined.squared_in(Some(map), i, &sums[i], [base; 3])[0][0]);
+                stated += (0..sums.len()).map(squared).sum::<f64>() / sums.len() as f64;
+                let apart = |i: usize| mapped(base + combined.correction[i][0]) - mapped(base + truth[i]);
+                found += mean_square((0..sums.len()).map(apart));
+            }
+            assert!((stated / found - 1.0).abs() < 0.05, "{how:?}: stated {stated}, found {found}");
+        }
     }
 
     #[test]

@@ -158,3 +158,17 @@ fn a_target_is_reached_when_it_is_met() {
     assert!(held(0), "{found:.2?}");
     assert!(!held(1), "the estimate alone would do: {found:.2?}");
 }
+
+/// Half a pair a pixel and round, spread evenly: the second round completes the picture.
+#[test]
+fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
+    let [traced, surrogate] = fields(0);
+    let mut renderer = renderer(32, 5);
+    let mut picture = Picture::default();
+    let unbiased = [0, 1].map(|number| {
+        let round =
+            Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: true, samples: 1.0, number, stop: &NEVER };
+        renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap().2.unbiased
+    });
+    assert_eq!(unbiased, [false, true]);
+}

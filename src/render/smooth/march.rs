@@ -22,7 +22,7 @@ const MEND_DIMENSION: u32 = u32::MAX - 3;
 /// the squared error, 1/4 or less.
 const HALVED: f32 = 0.25;
 const HALVED_AGAIN: f32 = 0.353_553_4;
-/// Largest number of halvings, which leave 2^-16 of the error of smooth fields.
+/// Largest number of halvings, which leave 2^-16 of the error of smooth fields, unless a ray has as many points as it may before.
 const MOST_HALVINGS: u32 = 8;
 
 /// How the transmittance to the light is found.
@@ -66,12 +66,9 @@ impl RaySum {
         self.missing += ray.missing;
     }
 
-    /// Adds `weight` times the difference of two rays.
+    /// Adds `weight` times the difference between the radiances of two rays. The other fields, shares and a mean that may not leave their ranges, stay.
     fn add_difference(&mut self, weight: f32, ray: &Self, less: &Self) {
         (0..3).for_each(|k| self.radiance[k] += weight * (ray.radiance[k] - less.radiance[k]));
-        self.alpha += weight * (ray.alpha - less.alpha);
-        self.ftle += weight * (ray.ftle - less.ftle);
-        self.missing += weight * (ray.missing - less.missing);
     }
 }
 

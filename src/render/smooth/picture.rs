@@ -53,6 +53,13 @@ pub struct Refinement<'a> {
     pub stop: &'a AtomicBool,
 }
 
+impl Refinement<'_> {
+    /// Returns true if the mean of such pictures over seeds is to be that of the traced field.
+    fn is_mended(&self) -> bool {
+        self.sum && self.method == Method::TwoLevel
+    }
+}
+
 /// An accumulating picture.
 #[derive(Debug, Clone, Default)]
 pub struct Picture {
@@ -116,7 +123,10 @@ impl Picture {
         let combined = combine(&self.sums, width, how);
         let (film, error) = loop {
             let (film, error, tiles) = self.film(scene, width, height, how, &combined);
-            self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
+            // Samples that go where earlier ones saw a difference would make their mean biased (Kirk and Arvo 1991).
+            if !round.is_mended() {
+                self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
+            }
             let others = error.rms.value.powi(2) - self.march.error();
             if round.stop.load(Ordering::Relaxed) {
                 return self.stopped();
@@ -152,7 +162,8 @@ impl Picture {
         let step = medium.spacing() as f32 * self.march.step;
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
-        let marched = |pixel: u32, j: u64| match round.sum {
+        let mended = round.is_mended();
+        let marched = |pixel: u32, j: u64| match mended {
             true => medium.mended_ray(pixel, j, step, light),
             false => medium.ray(pixel, j, step, ToLight::Volume(light), false),
         };
@@ -175,7 +186,7 @@ impl Picture {
         let look = |&pixel: &u32| {
             let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(rays, &|j| marched(pixel, j)));
             let alpha = (alpha + more) / (shown + AUDIT_RAYS) as f64;
-            if round.sum {
+            if mended {
                 // What steps and light volume err, mended rays scatter.
                 return AuditedPixel { alpha, first, following, ..AuditedPixel::default() };
             }
@@ -184,7 +195,7 @@ impl Picture {
         };
         let mut compared: Vec<AuditedPixel> = audited.par_iter().map(look).collect();
         let mut lit: Vec<(&mut AuditedPixel, u32)> =
-            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit() && !round.sum).take(LIT_BY_MARCH).collect();
+            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit() && !mended).take(LIT_BY_MARCH).collect();
         lit.par_iter_mut().for_each(|(audited, pixel)| {
             let to_light = ToLight::March(step / LIGHT_STEPS as f32);
             audited.lit = Some(mean(0..PAIR, &|j| medium.ray(*pixel, j, fine, to_light, false)).0);
@@ -272,7 +283,8 @@ impl Picture {
         let tiles = self.tile_sums(scene, &film, combined);
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let march = self.march.error();
-        let unbiased = how == Correction::Summed;
+        // A pixel without pairs shows the march of the surrogate.
+        let unbiased = how == Correction::Summed && self.sums.iter().all(|sums| sums.pairs() > 0);
         let error = PictureError { unbiased, ..PictureError::of(&tiles, march, samples_per_pixel, self.march.rays) };
         let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
         let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };

@@ -41,3 +41,26 @@ impl ToneMap {
 pub fn squared_slope(tone_map: [f64; 3], radiance: f32) -> f32 {
     ToneMap::new(tone_map).slope(radiance).powi(2)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slopes_are_those_of_the_map() {
+        let map = ToneMap::new([1.85, 0.75, 1.4]);
+        let exact = |c: f64| ((c - 0.5) * 1.85 + 0.75).clamp(0.0, 1.0).powf(1.0 / 1.4);
+        // Black lies at 0.095 and white at 0.635.
+        for (at, from) in [(0.2, 0.5), (0.5, 0.2), (0.05, 0.4), (0.4, 0.05), (0.3, 0.9), (0.9, 0.3), (0.7, 0.8)] {
+            let secant = (exact(at) - exact(from)) / (at - from);
+            assert!((f64::from(map.secant(at as f32, from as f32)) - secant).abs() < 1e-5, "{at}, {from}");
+        }
+        for at in [0.12, 0.3, 0.6] {
+            let slope = (exact(at + 1e-5) - exact(at - 1e-5)) / 2e-5;
+            for found in [map.slope(at as f32), map.secant(at as f32, at as f32), map.secant(at as f32, at as f32 + 5e-4)] {
+                assert!((f64::from(found) / slope - 1.0).abs() < 1e-3, "{at}: {found}, {slope}");
+            }
+        }
+        assert_eq!([map.slope(0.05), map.slope(0.7), map.secant(0.7, 0.7)], [0.0; 3]);
+    }
+}

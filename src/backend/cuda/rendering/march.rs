@@ -393,7 +393,7 @@ impl GpuMarch {
     }
 
     /// Marches `rays` more rays of each pixel, on the work stream, in steps of at most `step` scene units. `shifted`: each pixel shifts its rays at
-    /// random, which makes their mean unbiased.
+    /// random, which makes their places unbiased, and follows them to their end.
     ///
     /// # Errors
     /// Nothing was prepared, or the device fails or lacks memory.

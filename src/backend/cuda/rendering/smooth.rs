@@ -61,6 +61,13 @@ pub(super) struct SmoothRound<'a> {
     pub(super) stop: &'a AtomicBool,
 }
 
+impl SmoothRound<'_> {
+    /// Returns true for the sum: its rays are shifted and its samples spread evenly, as on the CPU.
+    fn is_sum(&self) -> bool {
+        self.smooth.sum && self.smooth.method == Method::TwoLevel
+    }
+}
+
 impl GpuSmooth {
     /// Compiles the kernels or loads them from the cache.
     ///
@@ -150,7 +157,9 @@ impl GpuSmooth {
             let input = CombineInput { size: [width, height], pairs, march: &self.march, how, tone_map, lit: LIT };
             let tiles = self.combine.combine(&input)?;
             let error = PictureError::of(tiles, self.control.error(), samples_per_pixel, self.control.rays);
-            self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
+            if !round.is_sum() {
+                self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
+            }
             match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
                 Marching::Enough => break error,
                 Marching::Anew => {
@@ -179,7 +188,7 @@ impl GpuSmooth {
         let began = Instant::now();
         let medium = medium(&self.nodes, round, parameters)?;
         let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
-        self.march.march(&medium, step, due as u32, round.smooth.sum)?;
+        self.march.march(&medium, step, due as u32, round.is_sum())?;
         let random = FrameRandom::new(renderer.scene().seed, self.number);
         let pixels = self.control.audit_pixels(&random, parameters.pixels());
         self.control.rays += due;
@@ -191,7 +200,7 @@ impl GpuSmooth {
         let each = shown + AUDIT_RAYS as usize;
         let coarse = pixels.iter().flat_map(|&pixel| rays(pixel, each as u64, step, 0.0));
         let checks: Vec<RayCheck> = coarse.chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0))).collect();
-        let found = self.march.check(&medium, &checks, round.smooth.sum)?;
+        let found = self.march.check(&medium, &checks, round.is_sum())?;
         fn mean<const N: usize>(rays: &[[f32; 4]]) -> [f64; N] {
             std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
         }
@@ -204,7 +213,7 @@ impl GpuSmooth {
         let mut compared: Vec<AuditedPixel> = coarse.chunks_exact(each).zip(finer.chunks_exact(pair)).map(look).collect();
         let lit: Vec<usize> = (0..pixels.len()).filter(|&number| compared[number].is_lit()).take(LIT_BY_MARCH).collect();
         let checks: Vec<RayCheck> = lit.iter().flat_map(|&number| rays(pixels[number], PAIR, fine, to_light)).collect();
-        let found = self.march.check(&medium, &checks, round.smooth.sum)?;
+        let found = self.march.check(&medium, &checks, round.is_sum())?;
         for (&number, rays) in lit.iter().zip(found.chunks_exact(pair)) {
             compared[number].lit = Some(mean(rays));
         }
