@@ -34,7 +34,10 @@ after(async () => {
 });
 
 beforeEach(async () => { page = await open(); });
-afterEach(() => page.context().close());
+afterEach(async () => {
+  proxy.change = null;
+  await page.context().close();
+});
 
 // Reading the canvas back is what the tests do, not the page.
 const isComplaint = (message) => ["error", "warning"].includes(message.type()) && !message.text().includes("getImageData");
@@ -156,7 +159,6 @@ test("a picture that cannot be decoded is skipped, and said", async () => {
   };
   await until("it is said", async () => /The picture of frame [\d,]+ was skipped/.test(await warning()));
   await advance((await position()) + 2);
-  proxy.change = null;
   assert.deepEqual(complaints, []);
 });
 
@@ -171,7 +173,6 @@ test("unknown fields and null values are shown as unknown", async () => {
   };
   await page.reload();
   await following();
-  proxy.change = null;
   assert.match(await state(), /error unknown, share traced unknown\.$/);
   assert.equal(await page.textContent('[data-fact="device"]'), "–");
   assert.ok(await page.isVisible("#scale-note"));
@@ -186,7 +187,6 @@ test("what is over the tolerance cannot be overlooked", async () => {
     return compose(json, payload);
   };
   await until("it is said", async () => /Error above the tolerance by 0.0123/.test(await warning()));
-  proxy.change = null;
   assert.ok(await page.isVisible("#warnings .critical"));
   await page.click("#messages summary");
   await until("the messages are counted", async () => /snapshot repeats time 3( \(\d+ times\))?/.test(await page.textContent("#log")));
