@@ -42,7 +42,7 @@ pub struct RunArguments {
     /// endpoint of --publish, or else where only this user reaches them.
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
     dashboard: Option<Option<u16>>,
-    /// Accept signed commands (camera, tolerance, colours, method, budget, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
+    /// Accept signed commands (camera, tolerance, colours, method, budget, tau, direction, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
     /// which is printed, holds the key. With --dashboard its page steers, and without ENDPOINT another one is taken if private is in use.
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<String>>,

@@ -4,6 +4,7 @@
 //! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
 //! with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
+use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::record::Frame;
 use super::scene::settled_scene;
@@ -128,11 +129,15 @@ pub(super) struct Run<'a> {
     pub(super) began: Instant,
     pub(super) report: &'a mut RunReport,
     pub(super) renderer: Renderer,
+    /// The flow map as the scene and commands ask for it; [`Cycle::map`] is what came of it.
+    pub(super) asked: FlowMap,
     /// `[render]` with the method and the budget that commands set.
     pub(super) render: RenderSettings,
     /// The newest budget, also while the method has none.
     budget: Option<f64>,
     pub(super) transfer: TransferRecord,
+    /// A command set the range of the colours.
+    pub(super) has_range: bool,
     pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
@@ -227,7 +232,7 @@ pub(super) struct Cycle<'a, B: Backend> {
     /// Flow map with its number of steps: that of the first slide, so that frames are comparable, unless the picture decides on it.
     pub(super) map: FlowMap,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
-    settled: Option<(StepChoice, PictureSteps)>,
+    pub(super) settled: Option<(StepChoice, PictureSteps)>,
 }
 
 /// What commands changed since the last frame, by what follows from it.
@@ -240,6 +245,8 @@ enum Commands {
     Method,
     /// The ramp or the tolerance too, by which steps are chosen.
     Colours,
+    /// Tau or direction: all that was traced is of another flow map.
+    Map,
 }
 
 /// Place of a frame in its slide.
@@ -440,9 +447,11 @@ impl<'a> Run<'a> {
             began,
             report,
             renderer,
+            asked: plan.map.clone(),
             budget: render.budget,
             render,
             transfer,
+            has_range: false,
             color_bar,
             learning,
             progress,
@@ -453,7 +462,7 @@ impl<'a> Run<'a> {
 
 impl<B: Backend> Cycle<'_, B> {
     /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer.
-    fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
+    pub(super) fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
         let shown = self.run.shown();
         let Some(chosen) = chosen.filter(|_| suit_the_picture(shown.plan)) else { return Ok(()) };
         let settled = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
@@ -474,7 +483,7 @@ impl<B: Backend> Cycle<'_, B> {
             if !is_outdated(shown, slide, chosen, settled)? {
                 return Ok(None);
             }
-            match cpu_tracer(slide.velocity.clone(), &shown.plan.map, slide.time) {
+            match cpu_tracer(slide.velocity.clone(), shown.map, slide.time) {
                 Ok(tracer) => {
                     let anew = tracer.step_choice().unwrap_or(chosen);
                     Ok(Some(Ok((anew, picture_steps(shown, slide, anew)?))))
@@ -520,7 +529,7 @@ impl<B: Backend> Cycle<'_, B> {
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         self.prepare_first(&mut slide)?;
         loop {
-            self.frames(&*slides, &mut slide, begun, sink)?;
+            self.frames(slides, &mut slide, begun, sink)?;
             // Tracer and slide both hold the window, on the host and on the device.
             with!(&mut self.session, on => {
                 on.tracer = None;
@@ -599,7 +608,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// The frames of one slide, and what commands ask for besides.
-    fn frames(&mut self, slides: &dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+    fn frames(&mut self, slides: &mut dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let planned = warmups + time.frames_per_slide;
@@ -615,16 +624,16 @@ impl<B: Backend> Cycle<'_, B> {
             // Only smooth methods have a target.
             let target = self.run.render.until;
             let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
-            if commands == Commands::Colours && self.look_at_steps(slide)? {
+            if commands == Commands::Map {
+                self.take_map(slides, slide)?;
+            } else if commands == Commands::Colours && self.look_at_steps(slide)? {
                 with!(&mut self.session, on => {
                     on.tracer = None;
                     on.picture = Default::default();
                 });
                 self.trace_anew(slide)?;
                 self.run.learning.trust.reset();
-                // Other points than at the begin of the slide, which the network was trained on.
-                let stream = slide.index + ((self.run.progress.frame + 1) << 32);
-                transaction!(self, slide, run, on => run.probe(on, stream));
+                self.probe_again(slide)?;
             }
             slide.waited += std::mem::take(&mut self.run.progress.waited);
             let place =
@@ -679,6 +688,13 @@ impl<B: Backend> Cycle<'_, B> {
         }
     }
 
+    /// Probes at other points than at the begin of the slide, which the network was trained on.
+    pub(super) fn probe_again(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        let stream = slide.index + ((self.run.progress.frame + 1) << 32);
+        transaction!(self, slide, run, on => run.probe(on, stream));
+        Ok(())
+    }
+
     /// Whether a command comes while a simulation's next window is incomplete: the slide then gets another frame.
     fn is_commanded_meanwhile(&mut self, slides: &dyn Slides) -> Result<bool, RunEnd> {
         if self.run.options.steering.is_none() || slides.is_over() {
@@ -718,7 +734,13 @@ impl<B: Backend> Cycle<'_, B> {
 
 impl Run<'_> {
     fn shown(&self) -> Shown<'_> {
-        Shown { plan: self.plan, transfer: self.renderer.transfer(), tolerance: self.learning.trust.tolerance(), stop: self.stop }
+        Shown {
+            plan: self.plan,
+            map: &self.asked,
+            transfer: self.renderer.transfer(),
+            tolerance: self.learning.trust.tolerance(),
+            stop: self.stop,
+        }
     }
 
     /// Ends the run if that was asked for, or its time is up.
@@ -746,6 +768,7 @@ impl Run<'_> {
         for command in steering.take() {
             let set = &command.set;
             changed = changed.max(match set {
+                _ if set.tau.is_some() || set.direction.is_some() => Commands::Map,
                 _ if set.range.is_some() || set.tolerance.is_some() => Commands::Colours,
                 _ if set.method.is_some_and(|method| method != self.render.method) => Commands::Method,
                 _ => Commands::View,
@@ -783,6 +806,9 @@ impl Run<'_> {
             // Its residuals are those of another ramp.
             self.learning.trust.reset();
         }
+        self.has_range |= set.range.is_some();
+        // The flow map follows once all commands are applied.
+        self.asked = asked(&self.asked, set);
         if let Some(method) = set.method {
             // Of another method.
             self.progress.seconds_per_sample = None;
@@ -796,9 +822,13 @@ impl Run<'_> {
         if let Some(tolerance) = set.tolerance {
             self.learning.trust.set_tolerance(tolerance);
         }
+        self.draw_color_bar();
+        Ok(())
+    }
+
+    pub(super) fn draw_color_bar(&mut self) {
         let TransferRecord { low, high, .. } = self.transfer;
         self.color_bar = Arc::new(ColorBar::new(&self.renderer, [low, high], &self.plan.time_unit));
-        Ok(())
     }
 
     /// Starts a checkpoint if one is due. A disk error fails the checkpoint, not the run.
@@ -811,8 +841,8 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Warnings about the flow map of the first slide.
-    fn flow_warnings(&self, flow: &dyn Tracer, chosen: Option<StepChoice>) -> Vec<String> {
+    /// Warnings about a flow map whose steps were chosen.
+    pub(super) fn flow_warnings(&self, flow: &dyn Tracer, chosen: Option<StepChoice>) -> Vec<String> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
         if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(

@@ -348,7 +348,7 @@ impl Run<'_> {
             time_unit: self.plan.time_unit.clone(),
             source: self.plan.source.clone(),
             transfer: self.transfer,
-            direction: self.plan.map.direction.name().into(),
+            direction: self.asked.direction.name().into(),
             method: self.render.method.name().into(),
             device: on.backend.name(),
             size: [film.width, film.height],

@@ -3,6 +3,7 @@
 //! In: [`Settings`], and commands while it goes on ([`Steering`]). Out: frames with their records. Calls `source`, `backend` and the rooms below it. Each frame is a transaction on one backend:
 //! its results take effect when it is complete. If the device fails, the frame is discarded and rendered again on the CPU.
 
+mod another_map;
 mod assess;
 mod checkpoints;
 mod color_bar;

@@ -253,10 +253,10 @@ impl Run<'_> {
             let draw = DURATIONS * self.progress.frame + part;
             let duration = tau * ((part + 1) as f64 - f64::from(uniform(seed, draw))) / DURATIONS as f64;
             let steps = match on.tracer().flow().steps() {
-                0 => self.plan.map.steps,
+                0 => self.asked.steps,
                 steps => Steps::Fixed((steps as f64 * duration / tau).ceil() as usize),
             };
-            let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
+            let map = FlowMap { tau: duration, steps, ..self.asked.clone() };
             let unit = stratified_points(&strata, seed, SHORTER_STREAM + draw);
             let backend = &mut on.backend;
             let shorter = self.threads.render().install(|| backend.tracer(&slide.velocity, &map, slide.time))?;

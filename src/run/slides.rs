@@ -65,6 +65,22 @@ pub trait Slides: Send {
     fn is_over(&self) -> bool {
         false
     }
+
+    /// Seeds later slides at the end of the window from which particles travel in this direction. Closed forms have no window.
+    fn turn(&mut self, _direction: Direction) {}
+}
+
+impl Slide {
+    /// Moves the seed time to the end of the window from which particles travel in this direction.
+    ///
+    /// # Errors
+    /// The window is empty.
+    pub(super) fn turn(&mut self, direction: Direction) -> Result<(), RunError> {
+        if let VelocitySource::Window(window) = &self.velocity {
+            self.time = seed_time(window, direction)?;
+        }
+        Ok(())
+    }
 }
 
 /// Counts slides up to a limit.
@@ -194,6 +210,10 @@ impl Slides for ArchiveSlides {
         self.reader.tell(listener);
     }
 
+    fn turn(&mut self, direction: Direction) {
+        self.direction = direction;
+    }
+
     fn expected(&self) -> Option<u64> {
         let times = &self.dates;
         let first = times.iter().position(|(t, _)| t - times[0].0 >= self.window.span() * (1.0 - 1e-9))?;
@@ -229,6 +249,10 @@ impl Slides for LiveSlides {
 
     fn listen(&self, listener: Listener) {
         self.window.tell(listener);
+    }
+
+    fn turn(&mut self, direction: Direction) {
+        self.direction = direction;
     }
 
     fn expected(&self) -> Option<u64> {

@@ -1,7 +1,9 @@
 //! Commands to a run in progress: checked as they come, applied between two frames, and kept in the record of the frame that shows them first.
 
 use super::setup::{Plan, assemble};
+use super::slides::closed_form;
 use crate::field::Domain;
+use crate::flow::Direction;
 use crate::render::{Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, require, shown};
 use crate::trust::TrustSettings;
@@ -28,6 +30,12 @@ pub struct Change {
     /// Milliseconds for the samples of a `two_level` frame.
     #[serde(rename = "render.budget", default, skip_serializing_if = "Option::is_none")]
     pub budget: Option<f64>,
+    /// |tau|, in the time unit of the run.
+    #[serde(rename = "time.tau", default, skip_serializing_if = "Option::is_none")]
+    pub tau: Option<f64>,
+    /// From which end of the window particles travel.
+    #[serde(rename = "time.direction", default, skip_serializing_if = "Option::is_none")]
+    pub direction: Option<Direction>,
     /// True: the window stands still.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub paused: Option<bool>,
@@ -55,6 +63,8 @@ impl Change {
         self.range = self.range.filter(|_| later.range.is_none());
         self.method = self.method.filter(|_| later.method.is_none());
         self.budget = self.budget.filter(|_| later.budget.is_none());
+        self.tau = self.tau.filter(|_| later.tau.is_none());
+        self.direction = self.direction.filter(|_| later.direction.is_none());
         self.paused = self.paused.filter(|_| later.paused.is_none());
     }
 }
@@ -83,6 +93,12 @@ pub struct SteeringState {
     pub method: Method,
     /// `render.budget` of the next frame, in milliseconds. `None` without one, or if the method has none.
     pub budget: Option<f64>,
+    /// |tau| of the next frame, in the time unit of the run.
+    pub tau: f64,
+    /// Direction of the next frame.
+    pub direction: Direction,
+    /// Longest |tau| that is accepted: that of the window. `None` for closed forms, which have no window.
+    pub longest_tau: Option<f64>,
 }
 
 /// The commands to a run. Its memory does not grow with them: a later value replaces an earlier one that has not taken effect.
@@ -95,8 +111,10 @@ pub struct Steering {
     transfer: TransferSettings,
     /// As the run began.
     render: RenderSettings,
-    direction: &'static str,
     dimensions: usize,
+    longest_tau: Option<f64>,
+    /// The network has times as inputs, whose range follows from tau and direction.
+    learns_times: bool,
     state: Mutex<State>,
     changed: Condvar,
 }
@@ -108,6 +126,8 @@ struct State {
     /// In effect once the pending commands are.
     method: Method,
     budget: Option<f64>,
+    tau: f64,
+    direction: Direction,
     /// The run makes no further frame.
     ended: bool,
     /// For the next frame.
@@ -115,8 +135,9 @@ struct State {
 }
 
 impl State {
-    fn new(render: &RenderSettings) -> Self {
-        Self { commands: 0, paused: false, method: render.method, budget: render.budget, ended: false, pending: Vec::new() }
+    fn new(render: &RenderSettings, tau: f64, direction: Direction) -> Self {
+        let (method, budget) = (render.method, render.budget);
+        Self { commands: 0, paused: false, method, budget, tau, direction, ended: false, pending: Vec::new() }
     }
 }
 
@@ -130,9 +151,10 @@ impl Steering {
             aspect: scene.render.aspect(),
             trust: scene.trust.clone(),
             transfer: scene.transfer.clone().unwrap_or_default(),
-            direction: plan.map.direction.name(),
             dimensions,
-            state: Mutex::new(State::new(&scene.render)),
+            longest_tau: closed_form(&scene.source).is_none().then_some(plan.map.tau),
+            learns_times: scene.render.method != Method::Reference && !scene.network.inputs.is_empty(),
+            state: Mutex::new(State::new(&scene.render, plan.map.tau, plan.map.direction)),
             render: scene.render.clone(),
             changed: Condvar::new(),
         }
@@ -153,14 +175,18 @@ impl Steering {
             state.paused = change.paused.unwrap_or(state.paused);
             state.method = change.method.unwrap_or(state.method);
             state.budget = change.budget.or(state.budget);
+            state.tau = change.tau.unwrap_or(state.tau);
+            state.direction = change.direction.unwrap_or(state.direction);
             state.pending.iter_mut().for_each(|earlier| earlier.set.remove(&change));
             state.pending.retain(|earlier| !earlier.set.is_empty());
             let number = state.commands;
             state.pending.push(Command { number, set: change });
             self.changed.notify_all();
         }
-        let State { commands, paused, method, budget, .. } = *state;
-        Ok(SteeringState { commands, paused, dimensions: self.dimensions, method, budget: budget.filter(|_| method == Method::TwoLevel) })
+        let State { commands, paused, method, budget, tau, direction, .. } = *state;
+        let budget = budget.filter(|_| method == Method::TwoLevel);
+        let Self { dimensions, longest_tau, .. } = *self;
+        Ok(SteeringState { commands, paused, dimensions, method, budget, tau, direction, longest_tau })
     }
 
     /// What a command changes. `method` is the one that is in effect without it.
@@ -193,14 +219,14 @@ impl Steering {
                 }
                 "render.budget" => change.budget = Some(read(key, value, "milliseconds, 0.1 to 600000")?),
                 "paused" => change.paused = Some(read(key, value, "true or false")?),
+                "time.tau" => change.tau = Some(self.check_tau(key, value)?),
                 "time.direction" => {
-                    let accepted =
-                        format!("\"{}\", as the run began: the other direction needs another window, and another run", self.direction);
-                    require(*value == *self.direction, key, value, &accepted)?;
+                    change.direction = Some(read(key, value, "\"forward\" or \"backward\"")?);
+                    self.check_times(key, value)?;
                 }
                 other => {
-                    let accepted =
-                        "camera, trust.tolerance, transfer, render.method, render.budget and paused: all else stays as the run began";
+                    let accepted = "camera, trust.tolerance, transfer, render.method, render.budget, time.tau, time.direction and paused: \
+                        all else stays as the run began";
                     return Err(Refused::new(other, "cannot change during a run", accepted));
                 }
             }
@@ -215,6 +241,33 @@ impl Steering {
             RenderSettings { method, budget: Some(budget), ..self.render.clone() }.check().map_err(Refused::from)?;
         }
         Ok(change)
+    }
+
+    /// A duration that the window holds.
+    fn check_tau(&self, key: &str, value: &Value) -> Result<f64, Refused> {
+        let accepted = match self.longest_tau {
+            Some(longest) => format!("a number above 0, at most {longest}: the window of this run is that long"),
+            None => "a number above 0".to_owned(),
+        };
+        let tau: f64 = read(key, value, &accepted)?;
+        require(tau > 0.0 && tau <= self.longest_tau.unwrap_or(f64::MAX), key, tau, &accepted)?;
+        self.check_times(key, value)?;
+        Ok(tau)
+    }
+
+    /// Refuses other times if the network has times as inputs.
+    fn check_times(&self, key: &str, value: &Value) -> Result<(), Refused> {
+        if self.learns_times {
+            let found = format!("is {}, and the network has times as inputs (network.inputs)", shown(value));
+            return Err(Refused::new(key, found, "the value that the run began with, and no other"));
+        }
+        Ok(())
+    }
+
+    /// Goes on with an earlier tau and direction, since those of a command could not be taken.
+    pub(super) fn keep(&self, tau: f64, direction: Direction) {
+        let mut state = self.lock();
+        (state.tau, state.direction) = (tau, direction);
     }
 
     /// Refuses a method that this run cannot take.
@@ -286,9 +339,10 @@ mod tests {
             trust: TrustSettings::default(),
             transfer: TransferSettings::default(),
             render: render.clone(),
-            direction: "forward",
             dimensions: 2,
-            state: Mutex::new(State::new(render)),
+            longest_tau: Some(10.0),
+            learns_times: false,
+            state: Mutex::new(State::new(render, 10.0, Direction::Forward)),
             changed: Condvar::new(),
         }
     }
@@ -320,7 +374,10 @@ mod tests {
             (json!({"transfer": {"low": 2, "high": 1}}), "`transfer.high` is 1.0"),
             (json!({"transfer": {"low": 2}}), "`transfer` cannot be read (missing field `high`)"),
             (json!({"paused": 1}), "`paused` is 1; accepted: true or false"),
-            (json!({"time.direction": "backward"}), "`time.direction` is \"backward\"; accepted: \"forward\", as the run began"),
+            (json!({"time.direction": "sideways"}), "`time.direction` is \"sideways\"; accepted: \"forward\" or \"backward\""),
+            (json!({"time.tau": 10.5}), "`time.tau` is 10.5; accepted: a number above 0, at most 10: the window"),
+            (json!({"time.tau": 0}), "`time.tau` is 0.0; accepted: a number above 0"),
+            (json!({"time.tau": "1 day"}), "`time.tau` is \"1 day\"; accepted: a number above 0"),
             (json!({"render.width": 64}), "`render.width` cannot change during a run; accepted: camera"),
             (json!({"render.method": "auto"}), "`render.method` is \"auto\"; accepted: reference, surrogate, gated, marched or two_level"),
             (json!({"render.method": "exact"}), "`render.method` is \"exact\"; accepted: reference, surrogate"),
@@ -337,9 +394,21 @@ mod tests {
             assert!(error.starts_with(hint), "{error}\n{hint}");
         }
         assert!(steering.take().is_empty() && !steering.is_paused());
-        let state = SteeringState { commands: 0, paused: false, dimensions: 2, method: Method::TwoLevel, budget: None };
+        let (method, direction, longest_tau) = (Method::TwoLevel, Direction::Forward, Some(10.0));
+        let state = SteeringState { commands: 0, paused: false, dimensions: 2, method, budget: None, tau: 10.0, direction, longest_tau };
         assert_eq!(command(&steering, json!({})), Ok(state));
-        assert_eq!(command(&steering, json!({"time.direction": "forward"})), Ok(state));
+        let direction = Direction::Backward;
+        let set = json!({"time.direction": "backward", "time.tau": 2.5});
+        assert_eq!(command(&steering, set), Ok(SteeringState { commands: 1, tau: 2.5, direction, ..state }));
+    }
+
+    #[test]
+    fn a_network_of_times_keeps_its_times() {
+        let steering = Steering { learns_times: true, ..steering() };
+        for set in [json!({"time.tau": 5}), json!({"time.direction": "backward"})] {
+            let error = command(&steering, set).unwrap_err();
+            assert!(error.contains("and the network has times as inputs (network.inputs)"), "{error}");
+        }
     }
 
     #[test]

@@ -29,6 +29,8 @@ const STREAM: u64 = u64::MAX - 1;
 #[derive(Clone, Copy)]
 pub(super) struct Shown<'a> {
     pub(super) plan: &'a Plan,
+    /// The flow map as it is asked for.
+    pub(super) map: &'a FlowMap,
     pub(super) transfer: &'a Transfer,
     /// Allowed optical residual of the picture.
     pub(super) tolerance: f64,
@@ -122,12 +124,12 @@ impl<'a> Comparison<'a> {
 
     /// In double precision, as the steps of the log-stretch are chosen.
     fn tracer(&self, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
-        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.shown.plan.map.clone() };
+        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.shown.map.clone() };
         cpu_tracer(self.slide.velocity.clone(), &map, self.slide.time)
     }
 
     fn ramp(&self, log_stretch: f32) -> f64 {
-        f64::from(self.shown.transfer.ramp(log_stretch / self.shown.plan.map.tau as f32))
+        f64::from(self.shown.transfer.ramp(log_stretch / self.shown.map.tau as f32))
     }
 
     fn of(&self, steps: usize) -> Result<PictureSteps, RunEnd> {

@@ -46,7 +46,12 @@ fn commands_are_passed_on_and_their_answers_back() {
     assert!(state["steering"]["none"].as_str().unwrap().contains("is not reached;"), "{state}");
     assert!(!state["steering"].to_string().contains("connection"), "{state}");
     let socket = command_socket(stage.folder.path());
-    let state = |commands, paused| json!({"commands": commands, "paused": paused, "dimensions": 2, "method": "gated", "budget": null});
+    let state = |commands, paused| {
+        json!({
+            "commands": commands, "paused": paused, "dimensions": 2, "method": "gated", "budget": null, "tau": 10.0, "direction": "forward",
+            "longest_tau": null,
+        })
+    };
     let begun = visitor.until_state(|state| !state["steering"]["ready"].is_null());
     assert_eq!(begun["steering"]["ready"], state(0, false));
     let paused = answer(&mut visitor, 2, json!({"paused": true}));

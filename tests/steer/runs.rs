@@ -1,7 +1,8 @@
 //! What commands do to a run.
 
+use crate::kit;
 use crate::kit::program::{ridgewatch, set, start, text, until};
-use crate::kit::scene::{double_gyre, setup, write};
+use crate::kit::scene::{double_gyre, run_frames, setup, write};
 use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
@@ -314,4 +315,92 @@ fn checkpoints_go_on_in_a_pause() {
     });
     let totals = report.checkpoints.unwrap();
     assert!(last == 32 && totals.failed == 0 && totals.written >= 4, "{totals:?}");
+}
+
+/// The picture is the one that a run of that tau and direction makes, whatever was traced before, and later slides follow.
+#[test]
+fn tau_and_direction_are_in_effect_on_the_next_frame() {
+    // Steps keep their length: 20 over 5 are 10 over 2.5.
+    let (long, short) = ("time.tau = 5\nflow.steps = 20\n", "time.tau = 2.5\ntime.direction = \"backward\"\nflow.steps = 10\n");
+    let marched = "surrogate.kind = \"table\"\nrender.method = \"marched\"\n";
+    let gyre = |keys: &str| setup(&double_gyre([48, 24, 1], &format!("{marched}{keys}")), &[]);
+    let turbulence = |keys: &str| {
+        let source = "source.nodes = [24, 12, 12]\nsource.snapshots = 8\ntransfer.low = 0.05\ntransfer.high = 0.3\n";
+        setup(&kit::scene::scene("turbulence", [48, 24, 1], &format!("{marched}{source}{keys}")), &[])
+    };
+    // The windows of the steered run end at 5 and 6, those of the other one at 3, 4 and 5. Closed forms have none, and the colours follow tau.
+    for (name, steered_run, times, other, same) in [
+        ("double gyre", gyre(&format!("{long}time.slides = 1\ntime.frames_per_slide = 2\n")), vec![0.0], gyre(short), 0),
+        (
+            "turbulence",
+            turbulence(&format!("{long}time.slides = 2\ntime.frames_per_slide = 2\n")),
+            vec![5.0, 6.0, 6.0],
+            turbulence(&format!("{short}time.slides = 3\n")),
+            2,
+        ),
+    ] {
+        let (frames, report) = steered(steered_run, |steering, frame| {
+            if frame.record.frame == 0 {
+                command(steering, json!({"time.tau": 2.5, "time.direction": "backward"}));
+            }
+            false
+        });
+        assert!(report.warnings.is_empty(), "{name}: {:?}", report.warnings);
+        let told: Vec<_> = frames.iter().map(|Frame { record, .. }| (record.tau, record.direction.as_str(), record.time)).collect();
+        let mut expected = vec![(5.0, "forward", 0.0)];
+        expected.extend(times.iter().map(|time| (2.5, "backward", *time)));
+        assert_eq!(told, expected, "{name}");
+        assert!(frames[1].record.warnings.is_empty(), "{name}: {:?}", frames[1].record.warnings);
+        assert_eq!(frames[1].record.integration_steps, Some(10), "{name}");
+        let mut others = Vec::new();
+        run_frames(other, &RunOptions { threads: 2, ..RunOptions::default() }, |frame| others.push(frame));
+        let (one, other) = (&frames[1], &others[same]);
+        assert_eq!(one.record.transfer, other.record.transfer, "{name}");
+        let furthest = |a: &Frame, b: &Frame| {
+            a.film.rgba.iter().flatten().zip(b.film.rgba.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+        };
+        assert!(furthest(one, other) < 1e-5, "{name}: {}", furthest(one, other));
+        assert!(furthest(&frames[0], one) > 0.1, "{name}: another map is another picture");
+    }
+}
+
+/// A run goes on with the map that it has where another one cannot be traced.
+#[test]
+fn a_tau_that_no_steps_suffice_for_is_told_and_has_no_effect() {
+    let keys = "time.tau = 5\ntime.frames_per_slide = 3\nsurrogate.kind = \"table\"\nrender.method = \"marched\"\n";
+    let (frames, _) = steered(setup(&double_gyre([24, 12, 1], keys), &[]), |steering, frame| {
+        match frame.record.frame {
+            0 => command(steering, json!({"time.tau": 2000})),
+            1 => {
+                let state = steering.command(&serde_json::Map::new()).unwrap();
+                assert_eq!((state.tau, state.longest_tau), (5.0, None));
+            }
+            _ => {}
+        }
+        false
+    });
+    assert_eq!(frames.iter().map(|frame| frame.record.tau).collect::<Vec<_>>(), [5.0; 3]);
+    let warnings = &frames[1].record.warnings;
+    assert!(warnings.iter().any(|warning| warning.starts_with("tau and direction stay 5 and forward: ")), "{warnings:?}");
+    assert!(frames[2].film.rgba.iter().flatten().all(|value| value.is_finite()));
+}
+
+/// Labels of the former map would teach the network a wrong field.
+#[test]
+fn a_network_forgets_what_it_learned_of_another_map() {
+    let network = "surrogate.kind = \"network\"\nnetwork.levels = 4\nnetwork.log2_table = 10\nnetwork.width = 16\nnetwork.batch = 512\n";
+    let keys = format!(
+        "time.tau = 5\nflow.steps = 20\ntime.frames_per_slide = 40\ntraining.steps_per_frame = 20\nrender.method = \"gated\"\n{network}"
+    );
+    let (frames, _) = steered(setup(&double_gyre([32, 16, 1], &keys), &[]), |steering, frame| {
+        if frame.record.frame == 19 {
+            command(steering, json!({"time.tau": 1.0, "time.direction": "backward"}));
+        }
+        false
+    });
+    let (before, after, last) = (&frames[19].record, &frames[20].record, &frames[39].record);
+    assert!(before.traced_share < 0.9, "the network had earned trust: {}", before.traced_share);
+    assert!(after.traced_share > before.traced_share, "{} {}", after.traced_share, before.traced_share);
+    let psnr = |record: &ridgewatch::run::FrameRecord| record.surrogate_psnr.unwrap();
+    assert!(psnr(last) > psnr(after) + 3.0, "it learns the new map: {} {}", psnr(after), psnr(last));
 }

@@ -237,10 +237,11 @@ function showSteering() {
   setText(element("obstacle"), obstacle ?? "");
   setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
   element("pause").setAttribute("aria-pressed", String(steering.paused));
-  const { method, budget } = steering.ready ?? {};
-  if (document.activeElement !== element("method")) element("method").value = method ?? "";
+  const { method, budget, tau, direction, longest_tau: longest } = steering.ready ?? {};
+  for (const [id, value] of Object.entries({ method, direction })) if (document.activeElement !== element(id)) element(id).value = value ?? "";
+  element("tau").max = longest ?? "";
   element("budget").disabled = method !== "two_level";
-  const values = { budget, tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  const values = { budget, tau, tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
@@ -325,16 +326,18 @@ for (const button of document.querySelectorAll("[data-save]")) button.addEventLi
 element("pause").addEventListener("click", () => steering.togglePause());
 element("home").addEventListener("click", () => steering.home());
 element("share").addEventListener("click", share);
-for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.budget"]]) {
+for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.budget"], ["tau", "time.tau"]]) {
   element(id).addEventListener("change", ({ target }) => {
     if (Number.isFinite(target.valueAsNumber)) steering.command({ [key]: target.valueAsNumber });
   });
 }
-element("method").addEventListener("change", ({ target }) => {
-  steering.command({ "render.method": target.value });
-  // Its keys are shortcuts again, and a method that is refused is not shown.
-  target.blur();
-});
+for (const [id, key] of [["method", "render.method"], ["direction", "time.direction"]]) {
+  element(id).addEventListener("change", ({ target }) => {
+    steering.command({ [key]: target.value });
+    // Its keys are shortcuts again, and a value that is refused is not shown.
+    target.blur();
+  });
+}
 for (const id of ["low", "high"]) {
   element(id).addEventListener("change", () => {
     const [low, high] = ["low", "high"].map((end) => element(end).valueAsNumber);

@@ -192,6 +192,29 @@ test("method and budget are in effect with a later record, and a budget needs it
   });
 });
 
+test("tau and direction are in effect with a later record, and a tau that is none is refused", async () => {
+  await steered("map", async (page, where) => {
+    const { frame, tau, direction } = newest(where);
+    assert.deepEqual([tau, direction], [10, "forward"]);
+    await until("both are shown", async () => (await page.inputValue("#direction")) === "forward" && (await page.inputValue("#tau")) === "10");
+    await page.selectOption("#direction", "backward");
+    const back = await commanded(where, frame, ["time.direction"]);
+    assert.deepEqual([back.direction, back.tau], ["backward", 10]);
+    await page.fill("#tau", "4");
+    await page.press("#tau", "Enter");
+    const short = await commanded(where, back.frame, ["time.tau"]);
+    assert.deepEqual([short.direction, short.tau], ["backward", 4]);
+    await page.fill("#tau", "-1");
+    await page.press("#tau", "Enter");
+    await until("it is refused", async () => /Refused: `time.tau` is -1.0; accepted: a number above 0/.test(await page.textContent("#warnings")));
+    await page.fill("#tau", "10");
+    await page.press("#tau", "Enter");
+    await commanded(where, short.frame, ["time.tau"]);
+    await page.selectOption("#direction", "forward");
+    await commanded(where, short.frame, ["time.direction"]);
+  });
+});
+
 test("a pause holds the window, is said, and the view still moves", async () => {
   await steered("map", async (page, where) => {
     const { frame } = newest(where);

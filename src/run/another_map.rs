@@ -1,0 +1,121 @@
+//! Another tau or direction, by a command to a run in progress.
+
+use super::cycle::{Cycle, fixed_steps};
+use super::scene::settled_colours;
+use super::slides::{Slide, Slides};
+use super::steering::Change;
+use super::stop::RunEnd;
+use super::transaction::{transaction, with};
+use super::{RunError, TransferRecord};
+use crate::backend::Backend;
+use crate::flow::{FlowMap, Steps};
+use crate::render::Renderer;
+use crate::surrogate::network::Times;
+use crate::surrogate::{ReplayBuffer, Trace};
+
+/// The flow map that a command asks for. Steps that the scene gives keep their length.
+pub(super) fn asked(former: &FlowMap, set: &Change) -> FlowMap {
+    let tau = set.tau.unwrap_or(former.tau);
+    let steps = match former.steps {
+        Steps::Fixed(steps) => Steps::Fixed(((steps as f64 * tau / former.tau).ceil() as usize).max(1)),
+        rule => rule,
+    };
+    FlowMap { tau, direction: set.direction.unwrap_or(former.direction), steps, ..former.clone() }
+}
+
+impl<B: Backend> Cycle<'_, B> {
+    /// Goes on with the flow map that was asked for, in the window as it is: colours that the scene leaves open, steps, surrogate and trust begin
+    /// anew, since all that was traced is of another map. If it cannot be traced, the former one stays, with a warning.
+    ///
+    /// # Errors
+    /// The device fails, a stop is requested, or no point has a velocity.
+    pub(super) fn take_map(&mut self, slides: &mut dyn Slides, slide: &mut Slide) -> Result<(), RunEnd> {
+        let (former, wanted) = (self.map.clone(), self.run.asked.clone());
+        let (former_tau, former_direction) = (former.tau, former.direction);
+        with!(&mut self.session, on => {
+            on.tracer = None;
+            on.picture = Default::default();
+        });
+        if let Err(end) = self.trace_from(slides, slide, wanted) {
+            let RunEnd::Failed(RunError::Flow(error)) = end else { return Err(end) };
+            self.run.progress.warnings.push(format!("tau and direction stay {former_tau} and {}: {error}", former_direction.name()));
+            let back = Change { tau: Some(former_tau), direction: Some(former_direction), ..Change::default() };
+            self.run.asked = self::asked(&self.run.asked, &back);
+            if let Some(steering) = &self.run.options.steering {
+                steering.keep(former_tau, former_direction);
+            }
+            return self.trace_from(slides, slide, former);
+        }
+        let chosen = with!(&self.session, on => on.tracer().flow().step_choice());
+        if let Some(steps) = with!(&self.session, on => fixed_steps(on.tracer().flow())) {
+            self.map.steps = Steps::Fixed(steps);
+        }
+        self.settled = None;
+        self.run.report.integration_difference = chosen.map(|chosen| chosen.difference).filter(|difference| difference.is_finite());
+        self.run.report.integration_residual = None;
+        self.run.report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));
+        self.draw_anew(slide)?;
+        let warnings = self.run.flow_warnings(with!(&self.session, on => on.tracer().flow()), chosen);
+        slide.warnings.extend(warnings);
+        self.settle_steps(slide, chosen)?;
+        self.learn_anew(slide)
+    }
+
+    /// Makes the flow map `map`, from the end of the window at which it starts.
+    fn trace_from(&mut self, slides: &mut dyn Slides, slide: &mut Slide, map: FlowMap) -> Result<(), RunEnd> {
+        slides.turn(map.direction);
+        slide.turn(map.direction)?;
+        slide.date = slides.date(slide.time);
+        self.map = map;
+        transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        Ok(())
+    }
+
+    /// A renderer of this flow map, with the view and the range that commands set.
+    fn draw_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        let mut scene = self.run.renderer.scene().clone();
+        if !self.run.has_range {
+            let plan = self.run.plan;
+            scene.transfer = loop {
+                let settled = with!(&self.session, on => {
+                    let tracer = on.tracer();
+                    self.run.threads.render().install(|| settled_colours(plan, tracer, slide))
+                });
+                match settled {
+                    Err(RunError::Device(error)) => self.session.recover(*error, slide, &self.map, &mut self.run)?,
+                    // The picture shows what is missing, in the former colours.
+                    Err(RunError::AllMissing { .. }) => break scene.transfer,
+                    settled => break settled?,
+                }
+            };
+        }
+        let range = (scene.transfer.low.unwrap_or_default(), scene.transfer.high.unwrap_or_default());
+        let run = &mut self.run;
+        let (plan, tau) = (run.plan, self.map.tau);
+        run.renderer = run.threads.render().install(|| Renderer::new(scene, &plan.domain, tau))?;
+        run.transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(run.renderer.transfer().extinction_max()) };
+        run.report.transfer = Some(run.transfer);
+        run.draw_color_bar();
+        Ok(())
+    }
+
+    /// A surrogate without labels, trust without residuals, and majorants that a pilot picture tightens.
+    fn learn_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        let plan = self.run.plan;
+        let (scene, tau) = (&plan.scene, self.map.tau);
+        let learning = &mut self.run.learning;
+        learning.trust.reset();
+        learning.buffer = ReplayBuffer::new(scene.training.replay_buffer);
+        learning.times = Times::new(&scene.network, tau);
+        learning.start = slide.time;
+        learning.resize = None;
+        learning.peak = f32::NEG_INFINITY;
+        self.run.progress.steps_shown = 0;
+        self.run.progress.has_warned_of_deaths = false;
+        if with!(&self.session, on => on.surrogate.is_some()) {
+            transaction!(self, slide, run, on => run.rebuild_surrogate(on));
+        }
+        transaction!(self, slide, run, on => run.pilot(on));
+        self.probe_again(slide)
+    }
+}
