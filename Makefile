@@ -3,6 +3,7 @@
 # make test-data       runs only the tests of real archives; RIDGEWATCH_DATA=folder names the folder of the archives
 # make test-reader     tests the NumPy reader of networks
 # make test-exports    checks exported fields with cfchecks and xarray, which go into target/exports; installs libudunits2-0 if apt is available
+# make test-clients    runs the Python clients of examples/ (notebook widget, tev) beside a run
 # make test-movies     tests films in MP4; installs ffmpeg if apt is available
 # make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
 # make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
@@ -56,7 +57,7 @@ PREFIX ?= /usr/local
 SONAME := libridgewatch_adapter.so.$(shell sed -n 's/^.define RW_VERSION //p' adapters/c/include/ridgewatch.h)
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-exports test-movies test-dashboard test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-clients test-exports test-movies test-dashboard test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -129,6 +130,11 @@ test-exports: packages
 	elif ! $(MAKE) --no-print-directory $(EXPORTS)/done; then echo "NOT RUN: the checks of exported fields, since their Python packages could not be fetched"; \
 	else scripts/check-exports target/release/ridgewatch $(EXPORTS)/venv $(EXPORTS)/tables $(wildcard $(RIDGEWATCH_DATA)); fi
 
+test-clients: packages
+	$(CARGO) build --release --bin ridgewatch
+	@if $(MAKE) --no-print-directory .venv/installed; then .venv/bin/python scripts/check-clients target/release/ridgewatch; else \
+	  echo "NOT RUN: the Python clients, since their packages could not be fetched (needs the network)"; fi
+
 test-movies: packages
 	@command -v ffmpeg >/dev/null || { command -v apt-get >/dev/null && $(SUDO) apt-get update -qq && \
 	  $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq ffmpeg >/dev/null || true; }
@@ -178,7 +184,7 @@ deny: $(CARGO_DENY)/bin/cargo-deny
 
 .venv/installed: Makefile | python-packages
 	$(PYTHON) -m venv .venv
-	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq xarray zarr
+	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq xarray zarr anywidget
 	touch $@
 
 $(NVRTC)/done: | python-packages

@@ -1,0 +1,48 @@
+// The view of `LiveFrames` in a notebook: the newest picture, and what its record says. See widget.py.
+const DASH = "–";
+const percent = (share) => (Number.isFinite(share) ? `${(100 * share).toPrecision(3)} %` : DASH);
+const decibels = (value) => (Number.isFinite(value) ? `${value.toFixed(1)} dB` : DASH);
+
+function words({ frame, slide, time, time_unit: unit, date, picture_error: error, traced_share: traced, device }) {
+  if (frame === undefined) return "";
+  const when = date ?? `t = ${time} ${unit ?? ""}`.trim();
+  const stated = error ? `error ${percent(error.rms?.value)} rms, ${decibels(error.psnr?.value)}` : "no error stated";
+  return `frame ${frame}, slide ${slide}, ${when}; ${stated}; ${percent(traced)} traced; ${device ?? DASH}`;
+}
+
+function render({ model, el }) {
+  const [picture, line, state] = ["img", "div", "div"].map((name) => el.appendChild(document.createElement(name)));
+  picture.style.maxWidth = "100%";
+  picture.alt = "newest frame";
+  let address = null;
+
+  const draw = async () => {
+    const bytes = model.get("picture");
+    if (!bytes?.byteLength) return;
+    const next = URL.createObjectURL(new Blob([bytes], { type: `image/${model.get("encoding")}` }));
+    const { frame } = model.get("record");
+    picture.src = next;
+    try {
+      await picture.decode();
+    } catch {
+      line.textContent = `The picture of frame ${frame} cannot be drawn.`;
+    }
+    if (address !== null) URL.revokeObjectURL(address);
+    address = next;
+    // The next frame is sent after this, so that none waits on the way.
+    model.send({ drawn: frame });
+  };
+  const tell = () => { line.textContent = words(model.get("record")); };
+  const report = () => { state.textContent = model.get("state"); };
+  const listeners = [["change:picture", draw], ["change:record", tell], ["change:state", report]];
+  for (const [event, act] of listeners) model.on(event, act);
+  tell();
+  report();
+  draw();
+  return () => {
+    for (const [event, act] of listeners) model.off(event, act);
+    if (address !== null) URL.revokeObjectURL(address);
+  };
+}
+
+export default { render };
