@@ -3,7 +3,7 @@
 use super::Interpolation;
 use rayon::prelude::*;
 use ridgewatch_field::{Axis, DomainPoint, Grid, Snapshot, Window};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// The missing cells of a window at one time.
 pub struct MissingCells {
@@ -11,12 +11,14 @@ pub struct MissingCells {
     snapshots: Vec<Arc<Snapshot>>,
     /// Nodes that the interpolation reads beyond a cell on either side.
     extra_nodes: usize,
+    /// Number of cells along x, y and z, and of each whether it is missing. Found by the first question: a picture asks once a step of every ray.
+    known: OnceLock<([usize; 3], Vec<bool>)>,
 }
 
 impl MissingCells {
     /// No cell is missing.
     pub fn none() -> Self {
-        Self { snapshots: Vec::new(), extra_nodes: 0 }
+        Self { snapshots: Vec::new(), extra_nodes: 0, known: OnceLock::new() }
     }
 
     /// Missing cells of a window for seeds at `time`.
@@ -27,7 +29,7 @@ impl MissingCells {
         let bracket = if exact { after..after + 1 } else { after.saturating_sub(1)..(after + 1).min(times.len()) };
         let count = bracket.len();
         let snapshots = window.snapshots().skip(bracket.start).take(count).filter(|s| s.missing_nodes() > 0).cloned().collect();
-        Self { snapshots, extra_nodes: usize::from(interpolation == Interpolation::Cubic) }
+        Self { snapshots, extra_nodes: usize::from(interpolation == Interpolation::Cubic), known: OnceLock::new() }
     }
 
     /// True if no cell is missing.
@@ -38,17 +40,27 @@ impl MissingCells {
     /// True if a node that the interpolation reads at the seed has no velocity.
     pub fn is_missing(&self, seed: DomainPoint) -> bool {
         let Some(grid) = self.grid() else { return false };
-        self.is_cell_missing(std::array::from_fn(|k| grid.axes.get(k).map_or(0, |axis| cell_at(axis, f64::from(seed.0[k])))))
+        let [x, y, z] = std::array::from_fn(|k| grid.axes.get(k).map_or(0, |axis| cell_at(axis, f64::from(seed.0[k]))));
+        let ([across, along, _], missing) = self.known(grid);
+        missing[(z * along + y) * across + x]
     }
 
     /// The grid and, for each of its cells (x fastest), whether the cell is missing; `None` if no cell is. A periodic axis has a cell
     /// between its last node and the image of the first.
     pub fn cells(&self) -> Option<(Arc<Grid>, Vec<bool>)> {
         let grid = self.grid()?;
-        let count: [usize; 3] = std::array::from_fn(|k| grid.axes.get(k).map_or(1, Axis::cells));
-        let cell = |i: usize| [i % count[0], i / count[0] % count[1], i / (count[0] * count[1])];
-        let cells = (0..count.iter().product()).into_par_iter().with_min_len(1 << 12).map(|i| self.is_cell_missing(cell(i))).collect();
+        let count = cell_counts(grid);
+        let cells =
+            (0..count.iter().product()).into_par_iter().with_min_len(1 << 12).map(|i| self.is_cell_missing(cell(i, count))).collect();
         Some((grid.clone(), cells))
+    }
+
+    fn known(&self, grid: &Grid) -> &([usize; 3], Vec<bool>) {
+        self.known.get_or_init(|| {
+            let count = cell_counts(grid);
+            // On this thread alone: a pool might run another question here, which would wait for this one.
+            (count, (0..count.iter().product()).map(|i| self.is_cell_missing(cell(i, count))).collect())
+        })
     }
 
     fn grid(&self) -> Option<&Arc<Grid>> {
@@ -72,6 +84,16 @@ impl MissingCells {
     }
 }
 
+/// Number of cells along x, y and z.
+fn cell_counts(grid: &Grid) -> [usize; 3] {
+    std::array::from_fn(|k| grid.axes.get(k).map_or(1, Axis::cells))
+}
+
+/// Place along x, y and z of cell `i`, x fastest.
+fn cell(i: usize, [across, along, _]: [usize; 3]) -> [usize; 3] {
+    [i % across, i / across % along, i / (across * along)]
+}
+
 /// Indices of the two nodes of a cell and of `extra_nodes` further ones on either side; the last node repeats past an end of the axis.
 fn nodes_read(axis: &Axis, cell: usize, extra_nodes: usize) -> [usize; 4] {
     let n = axis.len();
@@ -89,7 +111,11 @@ fn nodes_read(axis: &Axis, cell: usize, extra_nodes: usize) -> [usize; 4] {
 fn cell_at(axis: &Axis, x: f64) -> usize {
     let nodes = axis.coordinates();
     let x = axis.period().map_or(x, |period| axis.first() + (x - axis.first()).rem_euclid(period));
-    let above = nodes.partition_point(|c| *c <= x);
+    // On even axes, the place by the mean spacing is off by rounding at most.
+    let guess = ((x - nodes[0]) / (nodes[nodes.len() - 1] - nodes[0]) * (nodes.len() - 1) as f64) as usize + 1;
+    let is_above = |at: usize| at.checked_sub(1).is_none_or(|below| nodes[below] <= x) && nodes.get(at).is_none_or(|c| *c > x);
+    let above = [guess, guess + 1, guess.saturating_sub(1)].into_iter().find(|&at| at <= nodes.len() && is_above(at));
+    let above = above.unwrap_or_else(|| nodes.partition_point(|c| *c <= x));
     match axis.period() {
         Some(_) => (above + nodes.len() - 1) % nodes.len(),
         None => above.clamp(1, nodes.len() - 1) - 1,

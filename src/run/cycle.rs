@@ -404,18 +404,21 @@ impl<'a> Run<'a> {
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
         let color_bar = Arc::new(ColorBar::new(&renderer, [range.0, range.1], &plan.time_unit));
+        let pixels = [scene.render.width, scene.render.height];
+        let for_picture = scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain);
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
                 let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
                 let most = if first.live.is_some() { max_live_nodes(scene, &options.device).min(own) } else { own };
-                window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape(), most))
+                window.grid().map(|grid| {
+                    let [x, y, z] = grid.shape();
+                    let [fine_x, fine_y, _] = for_picture.table_nodes.unwrap_or_default();
+                    scene.surrogate.at_resolution_of([x.max(fine_x), y.max(fine_y), z], most)
+                })
             }
             VelocitySource::Analytic(..) => None,
         };
-        let settings = settings.unwrap_or_else(|| {
-            let pixels = [scene.render.width, scene.render.height];
-            scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain)
-        });
+        let settings = settings.unwrap_or(for_picture);
         let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
         let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
         let times = Times::new(&scene.network, flow.tau());

@@ -319,7 +319,8 @@ impl SurrogateSettings {
     }
 
     /// Returns the settings with nodes for a smooth picture of a two-dimensional flow, unless they are set: two per pixel along the longest edge. A
-    /// table of such a flow takes no more traces than four samples a pixel, and removes more error than they do.
+    /// table of such a flow takes no more traces than four samples a pixel, and removes more error than they do: the FTLE folds into filaments far finer
+    /// than the nodes of data.
     pub fn for_picture(&self, is_smooth: bool, pixels: [usize; 2], domain: &Domain) -> Self {
         const MAX_ALONG_EDGE: usize = 4096;
         if !is_smooth || domain.dimensions > 2 || self.kind != Kind::Table || self.table_nodes.is_some() {
