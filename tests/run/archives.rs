@@ -62,6 +62,25 @@ fn an_archive_with_land_goes_through_the_whole_loop() {
     assert!(summary["run"]["surrogate_bytes"].as_u64().unwrap() > 21 * 17 * 4);
 }
 
+/// The FTLE folds into filaments finer than the nodes of the data: the picture of a table at these is mostly the noise of its correction.
+#[test]
+fn smooth_pictures_of_a_flat_archive_have_a_table_as_fine_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = eddy(folder.path());
+    let stated = |name: &str, keys: &[&str]| {
+        let run = folder.path().join(name);
+        let common = ["time.tau=6 days", "time.slides=1", "render.samples=8", "transfer.low=1e-6", "transfer.high=5e-6"];
+        replay(text(&file), &run, &set(&[&common, keys].concat()));
+        (summary(&run)["run"]["surrogate_bytes"].as_u64().unwrap(), records(&run)[0].picture_error.unwrap().rms.value)
+    };
+    // 48 pixels along 10 degrees, which are shorter than 8 along the meridian.
+    let (bytes, error) = stated("fine", &[]);
+    let (coarse_bytes, coarse_error) = stated("coarse", &["surrogate.table_nodes=[21, 17, 2]"]);
+    assert_eq!(coarse_bytes, 21 * 17 * 4);
+    assert!((97 * 80 * 4..=97 * 97 * 4).contains(&bytes), "{bytes}");
+    assert!(error < 0.7 * coarse_error, "{error} {coarse_error}");
+}
+
 #[test]
 fn the_shipped_archive_scenes_run_over_what_they_promise() {
     for (name, nodes, tau) in [("ecmwf", "[24, 12, 6]", 11.0), ("flame", "[24, 12, 12]", 6.0), ("globe", "[24, 13, 5]", 11.0 * 86_400.0)] {
