@@ -18,6 +18,7 @@ mod run_folder;
 mod scene;
 mod settings;
 mod summary;
+pub(crate) mod vtk_xml;
 mod zmq;
 
 pub use compare::{CompareError, Comparison, compare_files, compare_films};
