@@ -3,13 +3,14 @@
 use super::arrows::{Arrows, arrows};
 use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
 use super::contour::contours;
-use super::draw::{Bar, MapFigure, Panel};
+use super::draw::{MapFigure, Panel};
 use super::footprint::{MapTracer, Raster, RasterError, Sampling};
 use super::graticule::axis_unit;
 use super::lines::{RidgeLine, RidgesAbout};
 use super::projection::ProjectionKind;
 use super::record::{MapRecord, PanelRecord, RidgeRecord};
 use super::ridges::{Field, Strength};
+use super::sheet::Bar;
 use super::view::{View, is_geographic};
 use super::words::{Rate, date, duration, number};
 use super::{MapError, Moment};
@@ -307,7 +308,7 @@ fn figure(
             let values = || traced.iter().filter(|o| o.direction == t.direction).flat_map(|o| &o.raster.mean).filter(|v| v.is_finite());
             Bar {
                 label: format!("{} FTLE ({} structures){unit}", t.direction.name(), structures(t.direction)),
-                ramp: ramp(options.both, t.direction),
+                colours: (0..256).map(|part| ramp(options.both, t.direction).colour((f64::from(part) + 0.5) / 256.0)).collect(),
                 range: shown,
                 goes_on: [values().any(|v| f64::from(*v) < scale[0]), values().any(|v| f64::from(*v) > scale[1])],
             }
