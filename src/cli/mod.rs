@@ -7,6 +7,7 @@ mod common;
 mod compare;
 mod dashboard;
 mod doctor;
+mod figure;
 mod ftle;
 mod inspect;
 mod map;
@@ -62,6 +63,8 @@ enum Command {
     Map(map::Options),
     /// Write the ridges of the FTLE of one moment as geometry: lines in two dimensions, surfaces in three.
     Ridges(ridges::Options),
+    /// Draw a frame of a run as a page with its colour bar, time, method and stated error.
+    Figure(figure::Options),
     /// Chart speed against accuracy of a scene: methods and settings, the Pareto front, and the pick.
     Chart(chart::Options),
     /// Train the scene's network offline on a still window, and show how its error falls.
@@ -108,6 +111,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Ftle(options) => ftle::run(&common, &options),
         Command::Map(options) => map::run(&common, &options),
         Command::Ridges(options) => ridges::run(&common, &options),
+        Command::Figure(options) => figure::run(&common, &options),
         Command::Chart(options) => chart::run(&common, &options),
         Command::Train(options) => train::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report, and figures are printed.
 
 mod command;
+mod figure;
 mod geometry;
 #[path = "../kit/mod.rs"]
 mod kit;

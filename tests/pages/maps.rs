@@ -28,11 +28,11 @@ fn every_field_of_the_record_has_its_row() {
 #[test]
 fn every_option_is_on_the_page() {
     let page = page("maps.md");
-    let commands = ["map", "ridges"];
+    let commands = ["map", "ridges", "figure"];
     for option in commands.iter().flat_map(|command| fields(&format!("src/cli/{command}.rs"), "Options")) {
         let option = option.replace('_', "-");
         assert!(
-            ["paths", "out"].contains(&option.as_str()) || page.contains(&format!("--{option}")),
+            ["paths", "run", "out"].contains(&option.as_str()) || page.contains(&format!("--{option}")),
             "docs/maps.md has no --{option}"
         );
     }
