@@ -2,7 +2,7 @@
 
 use crate::folder::Folder;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Write as _};
 use std::path::Path;
 
 /// Opens a regular file for reading. A pipe could wait for a writer forever, and a device has no length.
@@ -21,9 +21,17 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// # Errors
 /// Errors of the system; then the place is unchanged.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    write_with(path, |file| file.write_all(bytes))
+}
+
+/// As [`write_whole`], with what `write` puts into the new file.
+///
+/// # Errors
+/// Errors of the system and of `write`; then the place is unchanged.
+pub fn write_with(path: &Path, write: impl FnOnce(&mut File) -> io::Result<()>) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::new(ErrorKind::InvalidInput, "no file name"))?;
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    Folder::open(folder)?.write_whole(name, bytes)
+    Folder::open(folder)?.write_with(name, write)
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
 use ridgewatch::run::{RunError, Setup};
 use ridgewatch::setting::Refused;
-use ridgewatch::source::{SourceError, expand};
+use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
@@ -210,6 +210,15 @@ pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Res
     }
     if scene.surrogate.kind == Kind::Table {
         return refuse("a table is traced anew for every window and is not trained; accepted with surrogate.kind network and residual");
+    }
+    Ok(())
+}
+
+/// Refuses a running simulation, for a command that makes `what` of one moment.
+pub fn refuse_live(scene: &SceneFile, what: &str) -> Result<()> {
+    if scene.source.kind == SourceKind::Live {
+        let why = "--publish and dashboard show it; accepted: archives and closed forms";
+        bail!(Usage(format!("a running simulation has no {what} yet: {why}")));
     }
     Ok(())
 }

@@ -1,17 +1,16 @@
 //! `ridgewatch map`: the FTLE of one moment as a map, and its ridge lines.
 
-use super::common::{Common, Usage, check_folder, device, dimensions, located, print_json, print_text, scene, word};
+use super::common::{Common, Usage, check_folder, device, dimensions, located, print_json, print_text, refuse_live, scene, word};
 use super::messages;
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::files::write_whole;
 use ridgewatch::flow::Direction;
 use ridgewatch::map::{
-    self, LARGEST, LinesAbout, LinesFormat, MOST_NODES, MapError, MapOptions, MapRecord, Moment, PanelRecord, ProjectionKind, Rate,
-    RidgeLine, Sampling, Strength,
+    self, LARGEST, LinesFormat, MOST_NODES, MapError, MapOptions, MapRecord, Moment, PanelRecord, ProjectionKind, Rate, RidgeLine,
+    RidgesAbout, Sampling, Strength,
 };
 use ridgewatch::run::{RunError, TimeSpan};
-use ridgewatch::source::SourceKind;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -64,13 +63,13 @@ pub struct Options {
     #[arg(long, value_name = "FILE")]
     lines: Option<PathBuf>,
     /// Percentile of the FTLE that the mean over a ridge line reaches.
-    #[arg(long, value_name = "P", default_value_t = Strength::default().percentile, value_parser = percentile)]
+    #[arg(long, value_name = "P", default_value_t = Strength::LINES.percentile, value_parser = percentile)]
     ridge_percentile: f64,
     /// Least length of a ridge line, in nodes of the ridge grid.
-    #[arg(long, value_name = "NODES", default_value_t = Strength::default().length, value_parser = not_negative)]
+    #[arg(long, value_name = "NODES", default_value_t = Strength::LINES.extent, value_parser = not_negative)]
     ridge_length: f64,
     /// Standard deviation of the smoothing before derivatives, in nodes of the ridge grid; 0 for none.
-    #[arg(long, value_name = "NODES", default_value_t = Strength::default().smoothing, value_parser = smoothing)]
+    #[arg(long, value_name = "NODES", default_value_t = Strength::LINES.smoothing, value_parser = smoothing)]
     ridge_smoothing: f64,
     /// Grid on which ridges are found, NXxNY. Default: two nodes per pixel along x and y.
     #[arg(long, value_name = "NXxNY", value_parser = grid)]
@@ -88,11 +87,11 @@ fn projection(text: &str) -> Result<Projection, String> {
     word(text, "auto, plate_carree, mercator, lambert, polar, plain").map(|kind| Projection(Some(kind)))
 }
 
-fn direction(text: &str) -> Result<Direction, String> {
+pub(super) fn direction(text: &str) -> Result<Direction, String> {
     word(text, "forward, backward")
 }
 
-fn time_span(text: &str) -> Result<TimeSpan, String> {
+pub(super) fn time_span(text: &str) -> Result<TimeSpan, String> {
     let span = text.trim().parse().map_or_else(|_| TimeSpan::Words(text.trim().to_owned()), TimeSpan::Number);
     let value = span.value().filter(|value| value.is_finite() && *value > 0.0);
     value.map(|_| span).ok_or_else(|| "accepted: durations above 0, such as 7200 or \"30 days\"".into())
@@ -102,15 +101,15 @@ fn number(text: &str) -> Result<f64, String> {
     text.trim().parse().ok().filter(|n: &f64| n.is_finite()).ok_or_else(|| "accepted: a finite number".into())
 }
 
-fn percentile(text: &str) -> Result<f64, String> {
+pub(super) fn percentile(text: &str) -> Result<f64, String> {
     number(text).ok().filter(|n| (0.0..=100.0).contains(n)).ok_or_else(|| "accepted: a number from 0 to 100".into())
 }
 
-fn not_negative(text: &str) -> Result<f64, String> {
+pub(super) fn not_negative(text: &str) -> Result<f64, String> {
     number(text).ok().filter(|n| *n >= 0.0).ok_or_else(|| "accepted: a number from 0 on".into())
 }
 
-fn smoothing(text: &str) -> Result<f64, String> {
+pub(super) fn smoothing(text: &str) -> Result<f64, String> {
     number(text).ok().filter(|n| (0.0..=50.0).contains(n)).ok_or_else(|| "accepted: a number from 0 to 50".into())
 }
 
@@ -148,9 +147,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     if !["png", "svg"].contains(&extension.as_str()) {
         bail!(Usage(format!("--out {}: accepted: a name that ends in .png or .svg", options.out.display())));
     }
-    if scene.source.kind == SourceKind::Live {
-        bail!(Usage("a running simulation has no map yet: --publish and dashboard show it; accepted: archives and closed forms".into()));
-    }
+    refuse_live(&scene, "map")?;
     let record_file = options.out.with_extension("json");
     for out in [Some(&options.out), options.lines.as_ref()].into_iter().flatten() {
         check_folder(out)?;
@@ -168,7 +165,12 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
         None => None,
     };
-    let strength = Strength { percentile: options.ridge_percentile, length: options.ridge_length, smoothing: options.ridge_smoothing };
+    let strength = Strength {
+        percentile: options.ridge_percentile,
+        extent: options.ridge_length,
+        smoothing: options.ridge_smoothing,
+        ..Strength::LINES
+    };
     let wanted = MapOptions {
         pixels: options.width as usize,
         sampling: Sampling { seeds: options.seeds, seed: scene.seed },
@@ -226,7 +228,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
 }
 
 /// An error of a map with its place in the scene, and with the exit status of its kind.
-fn explained(scene: &SceneFile, error: MapError) -> anyhow::Error {
+pub(super) fn explained(scene: &SceneFile, error: MapError) -> anyhow::Error {
     match error {
         MapError::Usage(why) => Usage(why).into(),
         MapError::Run(error) => located(scene, error, RunError::refused),
@@ -265,7 +267,7 @@ fn line(panel: &PanelRecord, record: &MapRecord, rate: &Rate) -> String {
 }
 
 /// Writes ridge lines whole or not at all.
-fn write_lines(out: &Path, format: LinesFormat, lines: &[RidgeLine], about: &LinesAbout) -> Result<()> {
+pub(super) fn write_lines(out: &Path, format: LinesFormat, lines: &[RidgeLine], about: &RidgesAbout) -> Result<()> {
     match format {
         LinesFormat::GeoJson => Ok(write_whole(out, map::geojson(lines, about).as_bytes())?),
         LinesFormat::Vtk => Ok(write_whole(out, map::vtk(lines, about).as_bytes())?),

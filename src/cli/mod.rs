@@ -7,6 +7,7 @@ mod common;
 mod compare;
 mod dashboard;
 mod doctor;
+mod figure;
 mod ftle;
 mod inspect;
 mod map;
@@ -17,6 +18,7 @@ mod publish;
 mod relay;
 mod render;
 mod replay;
+mod ridges;
 mod session;
 mod signals;
 mod synthesize;
@@ -59,6 +61,10 @@ enum Command {
     Ftle(ftle::Options),
     /// Draw the FTLE of one moment as a map, with its ridge lines.
     Map(map::Options),
+    /// Write the ridges of the FTLE of one moment as geometry: lines in two dimensions, surfaces in three.
+    Ridges(ridges::Options),
+    /// Draw a frame of a run as a page with its colour bar, time, method and stated error.
+    Figure(figure::Options),
     /// Chart speed against accuracy of a scene: methods and settings, the Pareto front, and the pick.
     Chart(chart::Options),
     /// Train the scene's network offline on a still window, and show how its error falls.
@@ -104,6 +110,8 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Render(options) => render::run(&common, options),
         Command::Ftle(options) => ftle::run(&common, &options),
         Command::Map(options) => map::run(&common, &options),
+        Command::Ridges(options) => ridges::run(&common, &options),
+        Command::Figure(options) => figure::run(&common, &options),
         Command::Chart(options) => chart::run(&common, &options),
         Command::Train(options) => train::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),

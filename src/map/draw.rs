@@ -1,43 +1,14 @@
-//! The picture of a map: pixels, lines, graticule, colour bars and words, drawn by plotters.
-//!
-//! The PNG is drawn several times larger and averaged, since plotters places lines on whole pixels. Pixels without a line over them keep their colours
-//! exactly.
+//! The picture of a map: pixels, lines, graticule, colour bars and words.
 
-use super::colour::Ramp;
 use super::graticule::{GridLine, axis_unit, graticule};
 use super::projection::Projection;
+use super::sheet::{Bar, CENTRE, DrawError, Image, LEFT, Pen, Sheet, plot_error, sheet_png, sheet_svg};
 use super::view::View;
-use super::words::{duration, even_step, number, ticks};
-use base64::Engine as _;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder as _};
-use plotters::coord::Shift;
+use super::words::duration;
 use plotters::prelude::*;
-use plotters::style::text_anchor::{HPos, Pos, VPos};
-use plotters::style::{FontStyle, register_font};
-use thiserror::Error;
 
-/// Font that is built in, so that a map looks the same on every machine.
-const FONT: &str = "sans-serif";
-/// Times that the picture is larger while it is drawn.
-const FINER: f64 = 3.0;
 /// Panels in a row.
 const COLUMNS: usize = 3;
-
-/// Error of drawing a map.
-#[derive(Debug, Error)]
-pub enum DrawError {
-    /// plotters fails.
-    #[error("the map cannot be drawn: {0}")]
-    Plot(String),
-    /// The PNG cannot be encoded.
-    #[error("the map cannot be encoded: {0}")]
-    Encode(#[from] image::ImageError),
-}
-
-fn plot_error(error: impl std::fmt::Display) -> DrawError {
-    DrawError::Plot(error.to_string())
-}
 
 /// A map that can be drawn. All places are in pixels of a panel.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,19 +46,6 @@ pub struct Panel {
     pub ridges: Vec<([u8; 3], Vec<[f64; 2]>)>,
     /// Tails and tips of arrows.
     pub arrows: Vec<[[f64; 2]; 2]>,
-}
-
-/// A colour bar.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Bar {
-    /// What it shows, with its unit.
-    pub label: String,
-    /// Its colours.
-    pub ramp: Ramp,
-    /// Its ends.
-    pub range: [f64; 2],
-    /// Whether values lie below and above its ends.
-    pub goes_on: [bool; 2],
 }
 
 /// Places of all parts, in pixels of the picture.
@@ -134,43 +92,7 @@ impl Layout {
 /// # Errors
 /// plotters fails, or the picture cannot be encoded.
 pub fn write_png(figure: &MapFigure) -> Result<Vec<u8>, DrawError> {
-    let layout = Layout::new(figure);
-    // Large pictures are smooth enough at twice their size, which bounds the memory.
-    let finer = if layout.width * layout.height > 4e6 { 2.0 } else { FINER };
-    let scale = finer as usize;
-    let (width, height) = (layout.width as usize, layout.height as usize);
-    let (wide, high) = (width * scale, height * scale);
-    let mut fine = vec![255u8; wide * high * 3];
-    let [columns, rows] = figure.view.size;
-    for (panel, corner) in figure.panels.iter().zip(&layout.panels) {
-        let [x0, y0] = corner.map(|c| c as usize * scale);
-        for y in 0..rows * scale {
-            for x in 0..columns * scale {
-                let at = ((y0 + y) * wide + x0 + x) * 3;
-                fine[at..at + 3].copy_from_slice(&panel.pixels[y / scale * columns + x / scale]);
-            }
-        }
-    }
-    {
-        let area = BitMapBackend::with_buffer(&mut fine, (wide as u32, high as u32)).into_drawing_area();
-        Pen { area: &area, finer, in_parts: true }.figure(figure, &layout)?;
-        area.present().map_err(plot_error)?;
-    }
-    let mut pixels = vec![0u8; width * height * 3];
-    for (index, value) in pixels.iter_mut().enumerate() {
-        let (channel, x, y) = (index % 3, index / 3 % width, index / (3 * width));
-        let block = (0..scale * scale).map(|k| u32::from(fine[((y * scale + k / scale) * wide + x * scale + k % scale) * 3 + channel]));
-        let count = (scale * scale) as u32;
-        *value = ((block.sum::<u32>() + count / 2) / count) as u8;
-    }
-    png(width, height, &pixels)
-}
-
-fn png(width: usize, height: usize, pixels: &[u8]) -> Result<Vec<u8>, DrawError> {
-    let mut bytes = Vec::new();
-    let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
-    encoder.write_image(pixels, width as u32, height as u32, ExtendedColorType::Rgb8)?;
-    Ok(bytes)
+    sheet_png(&Laid { figure, layout: Layout::new(figure) })
 }
 
 /// Draws a map as SVG: lines and words as such, the pixels of each panel as a PNG inside.
@@ -178,100 +100,35 @@ fn png(width: usize, height: usize, pixels: &[u8]) -> Result<Vec<u8>, DrawError>
 /// # Errors
 /// plotters fails, or the pixels cannot be encoded.
 pub fn write_svg(figure: &MapFigure) -> Result<String, DrawError> {
-    let layout = Layout::new(figure);
-    let (width, height) = (layout.width, layout.height);
-    let mut text = String::new();
-    {
-        let size = ((width * FINER) as u32, (height * FINER) as u32);
-        let area = SVGBackend::with_string(&mut text, size).into_drawing_area();
-        Pen { area: &area, finer: FINER, in_parts: false }.figure(figure, &layout)?;
-        area.present().map_err(plot_error)?;
-    }
-    let (_, body) = text.split_once('>').ok_or_else(|| plot_error("the SVG has no head"))?;
-    let [columns, rows] = figure.view.size;
-    let mut whole = format!(
-        "<svg width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {0} {1}\" xmlns=\"http://www.w3.org/2000/svg\">\n\
-         <rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n",
-        width * FINER,
-        height * FINER
-    );
-    for (panel, [x, y]) in figure.panels.iter().zip(&layout.panels) {
-        let picture = png(columns, rows, &panel.pixels.concat())?;
-        let data = base64::engine::general_purpose::STANDARD.encode(picture);
-        whole += &format!(
-            "<image x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\" style=\"image-rendering: pixelated\" href=\"data:image/png;base64,{data}\"/>\n",
-            x * FINER,
-            y * FINER,
-            columns as f64 * FINER,
-            rows as f64 * FINER
-        );
-    }
-    whole += body.trim_start_matches('\n');
-    Ok(whole)
+    sheet_svg(&Laid { figure, layout: Layout::new(figure) })
 }
 
-/// Draws in pixels of the picture.
-struct Pen<'a, B: DrawingBackend> {
-    area: &'a DrawingArea<B, Shift>,
-    finer: f64,
-    /// Lines piece by piece: plotters fills a thick path as one polygon, in which parts that cross each other would be holes.
-    in_parts: bool,
+/// A map with the places of its parts.
+struct Laid<'a> {
+    figure: &'a MapFigure,
+    layout: Layout,
 }
 
-/// Where a text stands relative to its place.
-const LEFT: Pos = Pos { h_pos: HPos::Left, v_pos: VPos::Top };
-const CENTRE: Pos = Pos { h_pos: HPos::Center, v_pos: VPos::Top };
+impl Sheet for Laid<'_> {
+    fn size(&self) -> [f64; 2] {
+        [self.layout.width, self.layout.height]
+    }
+
+    fn images(&self) -> Vec<Image<'_>> {
+        let size = self.figure.view.size;
+        let panels = self.figure.panels.iter().zip(&self.layout.panels);
+        panels
+            .map(|(panel, corner)| Image { corner: *corner, shown: size.map(|n| n as f64), size, pixels: &panel.pixels, is_smooth: false })
+            .collect()
+    }
+
+    fn draw<B: DrawingBackend>(&self, pen: &Pen<'_, B>) -> Result<(), DrawError> {
+        pen.figure(self.figure, &self.layout)
+    }
+}
 
 impl<B: DrawingBackend> Pen<'_, B> {
-    fn at(&self, [x, y]: [f64; 2]) -> (i32, i32) {
-        ((x * self.finer).round() as i32, (y * self.finer).round() as i32)
-    }
-
-    fn line(&self, points: &[[f64; 2]], offset: [f64; 2], colour: RGBAColor, width: f64) -> Result<(), DrawError> {
-        let style = colour.stroke_width((width * self.finer).round().max(1.0) as u32);
-        let mut path: Vec<(i32, i32)> = points.iter().map(|p| self.at([p[0] + offset[0], p[1] + offset[1]])).collect();
-        path.dedup();
-        if path.len() < 2 {
-            return Ok(());
-        }
-        if !self.in_parts {
-            return self.area.draw(&PathElement::new(path, style)).map_err(plot_error);
-        }
-        path.windows(2).try_for_each(|pair| self.area.draw(&PathElement::new(pair.to_vec(), style)).map_err(plot_error))
-    }
-
-    fn text(&self, text: &str, place: [f64; 2], size: f64, anchor: Pos, angle: FontTransform) -> Result<(), DrawError> {
-        let style = TextStyle::from((FONT, size * self.finer).into_font().transform(angle)).pos(anchor).color(&BLACK);
-        self.area.draw_text(text, &style, self.at(place)).map_err(plot_error)
-    }
-
-    /// Width of a text, in pixels of the picture.
-    fn width(&self, text: &str, size: f64) -> Result<f64, DrawError> {
-        let style = TextStyle::from((FONT, size * self.finer).into_font());
-        Ok(f64::from(self.area.estimate_text_size(text, &style).map_err(plot_error)?.0) / self.finer)
-    }
-
-    /// A text that is cut at a word to fit, with an ellipsis.
-    fn fitting(&self, text: &str, size: f64, width: f64) -> Result<String, DrawError> {
-        let mut cut = text.to_owned();
-        while self.width(&cut, size)? > width {
-            let shorter: String = cut
-                .trim_end_matches('…')
-                .chars()
-                .collect::<Vec<_>>()
-                .split_last()
-                .map_or_else(String::new, |(_, rest)| rest.iter().collect());
-            if shorter.is_empty() {
-                break;
-            }
-            cut = format!("{}…", shorter.trim_end());
-        }
-        Ok(cut)
-    }
-
     fn figure(&self, figure: &MapFigure, layout: &Layout) -> Result<(), DrawError> {
-        register_font(FONT, FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT)
-            .map_err(|_| plot_error("the built-in font is not read"))?;
         let u = layout.unit;
         let margin = 16.0 * u;
         let room = layout.width - 2.0 * margin;
@@ -380,42 +237,5 @@ impl<B: DrawingBackend> Pen<'_, B> {
             self.line(&[first, [first[0] + 4.0 * u * out[0], first[1] + 4.0 * u * out[1]]], corner, BLACK.to_rgba(), u)?;
         }
         self.text(&line.label, [place[0], place[1] - size / 2.0], size, CENTRE, FontTransform::None)
-    }
-
-    fn bar(&self, bar: &Bar, [x, y]: [f64; 2], width: f64, u: f64) -> Result<(), DrawError> {
-        let (top, bottom) = (y + 22.0 * u, y + 38.0 * u);
-        let label = self.fitting(&bar.label, 15.0 * u, width + 40.0 * u)?;
-        self.text(&label, [x + width / 2.0, y], 15.0 * u, CENTRE, FontTransform::None)?;
-        let solid = |[r, g, b]: [u8; 3]| RGBColor(r, g, b).filled();
-        const PARTS: usize = 256;
-        for part in 0..PARTS {
-            // To the end of the bar, and the next one over it: in an SVG, seams between neighbours would show.
-            let ends = [self.at([x + width * part as f64 / PARTS as f64, top]), self.at([x + width, bottom])];
-            self.area.draw(&Rectangle::new(ends, solid(bar.ramp.colour((part as f64 + 0.5) / PARTS as f64)))).map_err(plot_error)?;
-        }
-        // Points at ends beyond which values lie.
-        let middle = (top + bottom) / 2.0;
-        let mut rim = Vec::new();
-        for (end, sign) in [(0, -1.0), (1, 1.0)] {
-            let edge = x + width * end as f64;
-            let corners = if sign < 0.0 { [[edge, bottom], [edge, top]] } else { [[edge, top], [edge, bottom]] };
-            if bar.goes_on[end] {
-                let tip = [edge + sign * 11.0 * u, middle];
-                let outline = vec![self.at(corners[0]), self.at(tip), self.at(corners[1])];
-                self.area.draw(&Polygon::new(outline, solid(bar.ramp.colour(end as f64)))).map_err(plot_error)?;
-                rim.extend([corners[0], tip, corners[1]]);
-            } else {
-                rim.extend(corners);
-            }
-        }
-        rim.push(rim[0]);
-        self.line(&rim, [0.0; 2], BLACK.to_rgba(), 0.9 * u)?;
-        let [low, high] = bar.range;
-        for tick in ticks(bar.range, even_step(high - low, 4.0)) {
-            let at = x + width * (tick - low) / (high - low);
-            self.line(&[[at, bottom], [at, bottom + 4.0 * u]], [0.0; 2], BLACK.to_rgba(), 0.9 * u)?;
-            self.text(&number(tick), [at, bottom + 6.0 * u], 14.0 * u, CENTRE, FontTransform::None)?;
-        }
-        Ok(())
     }
 }

@@ -17,9 +17,9 @@ pub struct RidgeLine {
     pub points: Vec<RidgePoint>,
 }
 
-/// What the files say of all lines.
+/// What files say of all ridges of a moment.
 #[derive(Debug, Clone, PartialEq)]
-pub struct LinesAbout {
+pub struct RidgesAbout {
     /// Title of the scene.
     pub title: String,
     /// Source of the velocity.
@@ -32,10 +32,19 @@ pub struct LinesAbout {
     pub rate: Rate,
     /// True if coordinates are longitudes and latitudes in degrees.
     pub is_geographic: bool,
-    /// Names and units of the two coordinates.
-    pub axes: [[String; 2]; 2],
-    /// Third coordinate.
+    /// Names and units of the coordinates.
+    pub axes: [[String; 2]; 3],
+    /// Third coordinate of lines.
     pub level: f64,
+}
+
+impl RidgesAbout {
+    /// Unit of the sharpness; without a unit of length if the coordinates have none.
+    pub(super) fn sharpness_unit(&self) -> String {
+        let length = if self.is_geographic { "km" } else { self.axes[0][1].as_str() };
+        let square = if length.is_empty() { String::new() } else { format!(" {length}-2") };
+        format!("{}{square}", self.rate.unit).trim_start().to_owned()
+    }
 }
 
 /// Kind of a file of lines, by its ending.
@@ -74,7 +83,7 @@ fn wrapped(longitude: f64) -> f64 {
 }
 
 /// Lines as a GeoJSON FeatureCollection. A line that crosses the antimeridian is cut there.
-pub fn geojson(lines: &[RidgeLine], about: &LinesAbout) -> String {
+pub fn geojson(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let features = lines.iter().enumerate().flat_map(|(number, line)| {
         let mut parts: Vec<Vec<[f64; 2]>> = vec![Vec::new()];
         for point in &line.points {
@@ -100,20 +109,20 @@ pub fn geojson(lines: &[RidgeLine], about: &LinesAbout) -> String {
     let features: Vec<_> = features.collect();
     let about = json!({
         "title": about.title, "source": about.source, "seed_time": about.when, "tau_unit": about.time_unit, "ftle_unit": about.rate.unit,
-        "sharpness_unit": format!("{} km-2", about.rate.unit),
+        "sharpness_unit": about.sharpness_unit(),
     });
     json!({ "type": "FeatureCollection", "ridgewatch": about, "features": features }).to_string()
 }
 
 /// Mean and largest FTLE and mean sharpness, in the unit of the map.
-fn figures(line: &RidgeLine, about: &LinesAbout) -> [f64; 3] {
+fn figures(line: &RidgeLine, about: &RidgesAbout) -> [f64; 3] {
     let mean = |of: &dyn Fn(&RidgePoint) -> f64| line.points.iter().map(of).sum::<f64>() / line.points.len().max(1) as f64;
     let largest = line.points.iter().map(|p| p.value).fold(f64::NEG_INFINITY, f64::max);
     [mean(&|p| p.value), largest, mean(&|p| p.sharpness)].map(|v| v * about.rate.factor)
 }
 
 /// Lines as legacy VTK polydata. On the sphere, coordinates are degrees.
-pub fn vtk(lines: &[RidgeLine], about: &LinesAbout) -> String {
+pub fn vtk(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let points: Vec<&RidgePoint> = lines.iter().flat_map(|line| &line.points).collect();
     let title: String =
         format!("ridgewatch FTLE ridges, {}, {}", about.title, about.when).chars().filter(|c| *c != '\n').take(200).collect();
@@ -154,7 +163,7 @@ pub fn vtk(lines: &[RidgeLine], about: &LinesAbout) -> String {
 ///
 /// # Errors
 /// libnetcdf fails.
-pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &LinesAbout) -> Result<(), netcdf::Error> {
+pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Result<(), netcdf::Error> {
     let points: Vec<&RidgePoint> = lines.iter().flat_map(|line| &line.points).collect();
     let mut file = netcdf::create(path)?;
     file.add_attribute("Conventions", "CF-1.8")?;

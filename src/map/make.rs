@@ -3,13 +3,14 @@
 use super::arrows::{Arrows, arrows};
 use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
 use super::contour::contours;
-use super::draw::{Bar, MapFigure, Panel};
+use super::draw::{MapFigure, Panel};
 use super::footprint::{MapTracer, Raster, RasterError, Sampling};
 use super::graticule::axis_unit;
-use super::lines::{LinesAbout, RidgeLine};
+use super::lines::{RidgeLine, RidgesAbout};
 use super::projection::ProjectionKind;
 use super::record::{MapRecord, PanelRecord, RidgeRecord};
 use super::ridges::{Field, Strength};
+use super::sheet::Bar;
 use super::view::{View, is_geographic};
 use super::words::{Rate, date, duration, number};
 use super::{MapError, Moment};
@@ -56,7 +57,7 @@ pub struct MapResult {
     /// Ridge lines of all panels.
     pub lines: Vec<RidgeLine>,
     /// What files of lines say.
-    pub about: LinesAbout,
+    pub about: RidgesAbout,
     /// Remarks for the user.
     pub notes: Vec<String>,
 }
@@ -106,7 +107,7 @@ pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &m
             let mut ridges = Vec::new();
             if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
                 let field = ridge_field(&view, &mut tracer, size, &mut |seeds| count(seeds as u64))?;
-                let kind = if direction == Direction::Forward { "repelling" } else { "attracting" };
+                let kind = structures(direction);
                 ridges = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
             }
             let flow = tracer.flow();
@@ -139,26 +140,31 @@ pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &m
         ftle_unit: rate.unit.clone(),
         range: shown,
         fastest: found.map(|arrows| arrows.fastest),
-        ridges: options.ridges.zip(nodes).map(|(Strength { percentile, length, smoothing }, grid)| RidgeRecord {
+        ridges: options.ridges.zip(nodes).map(|(Strength { percentile, extent, smoothing, .. }, grid)| RidgeRecord {
             grid,
             percentile,
-            length,
+            length: extent,
             smoothing,
         }),
         panels: traced.iter().map(|t| panel_record(t, options, &rate, shown)).collect(),
     };
-    let about = LinesAbout {
-        title: plan.scene.title.clone(),
-        source: plan.source.clone(),
-        when: when(moment),
-        time_unit: plan.time_unit.clone(),
-        rate,
-        is_geographic: geographic,
-        axes: axes(&moment.velocity).map(|(name, unit)| [name, unit]),
-        level,
-    };
+    let about = about(moment, rate, level);
     let lines = traced.into_iter().flat_map(|t| t.ridges).collect();
     Ok(MapResult { figure, record, lines, about, notes })
+}
+
+/// What files say of the ridges of a moment; `rate` is the unit of their FTLE.
+pub(super) fn about(moment: &Moment, rate: Rate, level: f64) -> RidgesAbout {
+    RidgesAbout {
+        title: moment.plan.scene.title.clone(),
+        source: moment.plan.source.clone(),
+        when: when(moment),
+        time_unit: moment.plan.time_unit.clone(),
+        rate,
+        is_geographic: is_geographic(&moment.velocity),
+        axes: axes(&moment.velocity).map(|(name, unit)| [name, unit]),
+        level,
+    }
 }
 
 /// Third coordinate of the seeds.
@@ -175,7 +181,7 @@ fn level(given: Option<f64>, domain: &crate::field::Domain) -> Result<f64, MapEr
 }
 
 /// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes [`MOST_NODES`].
-fn ridge_nodes(view: &View) -> [usize; 2] {
+pub(super) fn ridge_nodes(view: &View) -> [usize; 2] {
     let [west, south, east, north] = view.region;
     let shrink = if view.is_geographic { ((south + north) / 2.0).to_radians().cos().max(0.1) } else { 1.0 };
     let ratio = (east - west) * shrink / (north - south);
@@ -185,7 +191,12 @@ fn ridge_nodes(view: &View) -> [usize; 2] {
 }
 
 /// The FTLE at nodes from edge to edge of the data.
-fn ridge_field(view: &View, tracer: &mut MapTracer<'_>, size: [usize; 2], done: &mut dyn FnMut(usize)) -> Result<Field, MapError> {
+pub(super) fn ridge_field(
+    view: &View,
+    tracer: &mut MapTracer<'_>,
+    size: [usize; 2],
+    done: &mut dyn FnMut(usize),
+) -> Result<Field, MapError> {
     let [west, south, east, north] = view.region;
     let step = [(east - west) / (size[0] - 1) as f64, (north - south) / (size[1] - 1) as f64];
     let at = |i: usize, j: usize| [west + step[0] * i as f64, south + step[1] * j as f64];
@@ -206,13 +217,13 @@ fn ridge_field(view: &View, tracer: &mut MapTracer<'_>, size: [usize; 2], done: 
     Ok(Field { origin: [west, south], step, size, values, scale })
 }
 
-/// Names and units of the first two coordinates.
-fn axes(velocity: &VelocitySource) -> [(String, String); 2] {
-    [0, 1].map(|k| match velocity {
+/// Names and units of the coordinates.
+fn axes(velocity: &VelocitySource) -> [(String, String); 3] {
+    [0, 1, 2].map(|k| match velocity {
         VelocitySource::Window(window) => {
             window.grid().and_then(|g| g.axes.get(k)).map_or_else(Default::default, |a| (a.name().to_owned(), a.units().to_owned()))
         }
-        VelocitySource::Analytic(..) => (["x", "y"][k].into(), String::new()),
+        VelocitySource::Analytic(..) => (["x", "y", "z"][k].into(), String::new()),
     })
 }
 
@@ -232,7 +243,7 @@ fn name(plan: &Plan) -> String {
 }
 
 /// Seed time in words.
-fn when(moment: &Moment) -> String {
+pub(super) fn when(moment: &Moment) -> String {
     let unit = &moment.plan.time_unit;
     moment.date.as_deref().map_or_else(|| format!("t = {} {unit}", number(moment.time)).trim_end().to_owned(), date)
 }
@@ -269,7 +280,7 @@ fn ramp(both: bool, direction: Direction) -> Ramp {
 }
 
 /// Names of structures by the direction that shows them.
-fn structures(direction: Direction) -> &'static str {
+pub(super) fn structures(direction: Direction) -> &'static str {
     match direction {
         Direction::Forward => "repelling",
         Direction::Backward => "attracting",
@@ -297,7 +308,7 @@ fn figure(
             let values = || traced.iter().filter(|o| o.direction == t.direction).flat_map(|o| &o.raster.mean).filter(|v| v.is_finite());
             Bar {
                 label: format!("{} FTLE ({} structures){unit}", t.direction.name(), structures(t.direction)),
-                ramp: ramp(options.both, t.direction),
+                colours: (0..256).map(|part| ramp(options.both, t.direction).colour((f64::from(part) + 0.5) / 256.0)).collect(),
                 range: shown,
                 goes_on: [values().any(|v| f64::from(*v) < scale[0]), values().any(|v| f64::from(*v) > scale[1])],
             }
@@ -306,14 +317,8 @@ fn figure(
     let tau = if moment.taus.len() == 1 { format!(", tau = {}", duration(moment.taus[0], &plan.time_unit)) } else { String::new() };
     let names = axes(&moment.velocity);
     let level = if plan.domain.dimensions == 3 {
-        let (name, unit) = match &moment.velocity {
-            VelocitySource::Window(window) => window
-                .grid()
-                .and_then(|g| g.axes.get(2))
-                .map_or(("z".into(), String::new()), |a| (a.name().to_owned(), a.units().to_owned())),
-            VelocitySource::Analytic(..) => ("z".into(), String::new()),
-        };
-        let (unit, divisor) = axis_unit(&unit, view.level.abs());
+        let [.., (name, unit)] = &names;
+        let (unit, divisor) = axis_unit(unit, view.level.abs());
         let value = number(view.level / divisor);
         format!(", level {value} {unit} ({name})").replace("  ", " ")
     } else {
@@ -350,7 +355,12 @@ fn figure(
         title: format!("{what}: {}", name(plan)).trim_end_matches([':', ' ']).to_owned(),
         subtitle: format!("{}{tau}{level}", when(moment)),
         footer,
-        axes: if view.is_geographic { None } else { Some(names) },
+        axes: if view.is_geographic {
+            None
+        } else {
+            let [x, y, _] = names;
+            Some([x, y])
+        },
         view: view.clone(),
         panels,
         bars,

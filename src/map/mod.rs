@@ -1,7 +1,7 @@
-//! Maps: the FTLE of one moment as a picture for people, and its ridge lines.
+//! Maps: the FTLE of one moment as a picture for people, its ridge lines, and the ridge surfaces of volumes.
 //!
-//! In: the settings of a scene, a device and what to show. Out: a picture (PNG, SVG), a record of it, and lines (GeoJSON, NetCDF, VTK). Calls `run`
-//! and the rooms below it.
+//! In: the settings of a scene, a device and what to show. Out: a picture (PNG, SVG), a record of it, lines (GeoJSON, NetCDF, VTK) and surfaces (VTK,
+//! PLY). Calls `run` and the rooms below it, and `publish` for the parts of VTK files.
 //!
 //! Each pixel is the mean of the FTLE over what it covers, from seeds in two independent halves, whose difference is the stated error. Ridges are
 //! found on a grid of their own.
@@ -10,30 +10,44 @@ mod arrows;
 mod colour;
 mod contour;
 mod draw;
+mod find;
 mod footprint;
 mod graticule;
 mod lines;
 mod make;
 mod moment;
+mod page;
+mod pieces;
 mod projection;
 mod record;
 mod ridges;
+mod sheet;
+mod smoothing;
+mod surface_files;
+mod surfaces;
 mod view;
+mod volume;
 mod words;
 
 pub use arrows::{Arrows, arrows};
 pub use colour::{LAND, OUTSIDE, Ramp, overprinted};
 pub use contour::contours;
-pub use draw::{DrawError, MapFigure, write_png, write_svg};
+pub use draw::{MapFigure, write_png, write_svg};
+pub use find::{FoundRidges, RidgesOfMoment, RidgesRecord, find};
 pub use footprint::{MapTracer, Raster, RasterError, Sampling};
 pub use graticule::{GridLine, graticule, latitude, longitude};
-pub use lines::{LinesAbout, LinesFormat, RidgeLine, geojson, vtk, write_netcdf};
+pub use lines::{LinesFormat, RidgeLine, RidgesAbout, geojson, vtk, write_netcdf};
 pub use make::{MOST_NODES, MapOptions, MapResult, make};
 pub use moment::Moment;
+pub use page::FramePage;
 pub use projection::{Projection, ProjectionKind};
 pub use record::{MapRecord, PanelRecord, RidgeRecord};
 pub use ridges::{Field, RidgePoint, Strength};
+pub use sheet::DrawError;
+pub use surface_files::{SurfacesAbout, SurfacesFormat};
+pub use surfaces::{Surface, SurfacePoint, Surfaces};
 pub use view::{LARGEST, View, is_geographic};
+pub use volume::Volume;
 pub use words::{Rate, date, duration, number};
 
 use crate::run::RunError;

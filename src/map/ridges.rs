@@ -6,6 +6,7 @@
 //! sign of e (Furst and Pizer, Marching ridges, 2001).
 
 use super::contour::{Edge, Segments};
+use super::smoothing::smoothed;
 use rayon::prelude::*;
 
 /// A field on a regular grid, x fastest. Values that are not finite are missing.
@@ -26,18 +27,21 @@ pub struct Field {
 /// What counts as a ridge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Strength {
-    /// Percentile of the field, 0 to 100, that the mean over a line reaches. Points below three quarters of it belong to no line.
+    /// Percentile of the field, 0 to 100, that the mean over a ridge reaches. Points below three quarters of it belong to no ridge.
     pub percentile: f64,
-    /// Least length of a line, in nodes.
-    pub length: f64,
+    /// Percentile of the sharpness of all ridge points that are not cut off by their value, below which points belong to no ridge.
+    pub sharpness: f64,
+    /// Least length of a line, in nodes; least area of a surface, in squares of nodes.
+    pub extent: f64,
     /// Standard deviation of the Gaussian that smooths the field before it is differentiated, in nodes; 0 for none.
     pub smoothing: f64,
 }
 
-impl Default for Strength {
-    fn default() -> Self {
-        Self { percentile: 80.0, length: 30.0, smoothing: 2.0 }
-    }
+impl Strength {
+    /// Default of ridge lines.
+    pub const LINES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 30.0, smoothing: 2.0 };
+    /// Default of ridge surfaces, whose grids are coarser.
+    pub const SURFACES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 100.0, smoothing: 1.0 };
 }
 
 /// A point of a ridge.
@@ -67,7 +71,7 @@ struct Shape {
 impl Field {
     /// Ridge lines.
     pub fn ridges(&self, strength: &Strength) -> Vec<Vec<RidgePoint>> {
-        let smooth = self.smoothed(strength.smoothing);
+        let smooth = smoothed(&self.values, &self.size, strength.smoothing);
         let mut known: Vec<f64> = smooth.iter().copied().filter(|v| v.is_finite()).collect();
         if known.is_empty() {
             return Vec::new();
@@ -77,15 +81,18 @@ impl Field {
         let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
         let shapes: Vec<Option<Shape>> = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, largest)).collect();
         let [nx, ny] = self.size;
-        let mut segments = Segments::new();
+        let mut found = Vec::new();
         for j in 0..ny.saturating_sub(1) {
             for i in 0..nx.saturating_sub(1) {
                 for triangle in [[[i, j], [i + 1, j], [i, j + 1]], [[i + 1, j], [i, j + 1], [i + 1, j + 1]]] {
-                    self.cut(triangle, &shapes, &smooth, faint, &mut segments);
+                    found.extend(self.cut(triangle, &shapes, &smooth, faint));
                 }
             }
         }
-        let long = |line: &Vec<RidgePoint>| self.nodes_along(line) >= strength.length;
+        let sharp = least_sharpness(found.iter().flatten().map(|(_, point)| point.sharpness), strength.sharpness);
+        let mut segments = Segments::new();
+        found.into_iter().filter(|ends| ends.iter().all(|(_, point)| point.sharpness >= sharp)).for_each(|ends| segments.add(ends));
+        let long = |line: &Vec<RidgePoint>| self.nodes_along(line) >= strength.extent;
         let strong = |line: &Vec<RidgePoint>| line.iter().map(|p| p.value).sum::<f64>() / line.len() as f64 >= least;
         segments.lines().into_iter().filter(|line| long(line) && strong(line)).collect()
     }
@@ -94,38 +101,6 @@ impl Field {
     fn nodes_along(&self, line: &[RidgePoint]) -> f64 {
         let step = |k: usize, pair: &[RidgePoint]| (pair[1].place[k] - pair[0].place[k]) / self.step[k];
         line.windows(2).map(|pair| step(0, pair).hypot(step(1, pair))).sum()
-    }
-
-    /// The field after a Gaussian of this many nodes, over the known nodes only; missing nodes stay missing.
-    fn smoothed(&self, deviation: f64) -> Vec<f64> {
-        let values: Vec<f64> = self.values.iter().map(|v| f64::from(*v)).collect();
-        if deviation <= 0.0 {
-            return values;
-        }
-        let reach = (3.0 * deviation).ceil() as isize;
-        let kernel: Vec<f64> = (-reach..=reach).map(|k| (-0.5 * (k as f64 / deviation).powi(2)).exp()).collect();
-        let [nx, ny] = self.size;
-        // Sums of weighted values and of weights, along x and then along y.
-        let first: Vec<[f64; 2]> = values.iter().map(|v| if v.is_finite() { [*v, 1.0] } else { [0.0, 0.0] }).collect();
-        let pass = |of: &[[f64; 2]], along: usize| -> Vec<[f64; 2]> {
-            (0..of.len())
-                .into_par_iter()
-                .map(|node| {
-                    let at = [node % nx, node / nx];
-                    let (length, stride) = if along == 0 { (nx, 1) } else { (ny, nx) };
-                    kernel.iter().zip(-reach..=reach).fold([0.0; 2], |[sum, weight], (k, offset)| {
-                        let there = at[along] as isize + offset;
-                        if there < 0 || there >= length as isize {
-                            return [sum, weight];
-                        }
-                        let [v, w] = of[(node as isize + offset * stride as isize) as usize];
-                        [sum + k * v, weight + k * w]
-                    })
-                })
-                .collect()
-        };
-        let sums = pass(&pass(&first, 0), 1);
-        sums.iter().zip(&values).map(|([sum, weight], v)| if v.is_finite() { sum / weight } else { f64::NAN }).collect()
     }
 
     /// Derivatives at a node by central differences. `None` at edges, beside missing nodes, and where the field is flat within rounding.
@@ -164,21 +139,18 @@ impl Field {
         Some(Shape { across, slope: gradient[0] * across[0] + gradient[1] * across[1], curvature, trace: xx + yy })
     }
 
-    /// Adds the segment of a triangle of nodes, whose ends are the crossings of two of its sides.
-    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &[Option<Shape>], smooth: &[f64], faint: f64, segments: &mut Segments<RidgePoint>) {
+    /// The segment of a triangle of nodes, whose ends are the crossings of two of its sides.
+    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &[Option<Shape>], smooth: &[f64], faint: f64) -> Option<[(Edge, RidgePoint); 2]> {
         let nx = self.size[0];
         let at = |[i, j]: [usize; 2]| shapes[j * nx + i];
-        let [Some(a), Some(b), Some(c)] = triangle.map(at) else { return };
+        let [Some(a), Some(b), Some(c)] = triangle.map(at) else { return None };
         // Sides on which directions differ by 60 degrees or more belong to no common ridge. Below, the three signs cannot contradict each other.
         if [(a, b), (b, c), (c, a)].iter().any(|(p, q)| dot(p.across, q.across).abs() <= 0.5) {
-            return;
+            return None;
         }
         let mut ends = [(0, 1), (1, 2), (0, 2)].into_iter().filter_map(|(p, q)| self.crossing(triangle[p], triangle[q], shapes, smooth));
-        if let (Some(first), Some(second)) = (ends.next(), ends.next())
-            && first.1.value.min(second.1.value) >= faint
-        {
-            segments.add([first, second]);
-        }
+        let pair = [ends.next()?, ends.next()?];
+        pair.iter().all(|(_, point)| point.value >= faint).then_some(pair)
     }
 
     /// Zero of the slope on a side, by the cubic through four nodes in a row, else linear.
@@ -228,8 +200,15 @@ pub(super) fn percentile(sorted: &[f64], percent: f64) -> f64 {
     sorted[((sorted.len() - 1) as f64 * (percent / 100.0).clamp(0.0, 1.0)).round() as usize]
 }
 
+/// Sharpness below which `percent` of the ridge points lie; minus infinity for 0.
+pub(super) fn least_sharpness(of: impl Iterator<Item = f64>, percent: f64) -> f64 {
+    let mut sharpness: Vec<f64> = if percent > 0.0 { of.collect() } else { Vec::new() };
+    sharpness.par_sort_unstable_by(f64::total_cmp);
+    if sharpness.is_empty() { f64::NEG_INFINITY } else { percentile(&sharpness, percent) }
+}
+
 /// Zero in [0, 1] of the cubic through values at -1, 0, 1 and 2, which has opposite signs at 0 and 1.
-fn cubic_zero([before, low, high, after]: [f64; 4]) -> f64 {
+pub(super) fn cubic_zero([before, low, high, after]: [f64; 4]) -> f64 {
     let cubic = |t: f64| {
         -before * t * (t - 1.0) * (t - 2.0) / 6.0 + low * (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 - high * (t + 1.0) * t * (t - 2.0) / 2.0
             + after * (t + 1.0) * t * (t - 1.0) / 6.0

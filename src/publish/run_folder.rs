@@ -17,11 +17,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Folder of the pictures.
-const FRAMES: &str = "frames";
+pub(super) const FRAMES: &str = "frames";
 /// Records, one JSON object a line.
-const RECORDS: &str = "records.jsonl";
+pub(super) const RECORDS: &str = "records.jsonl";
 /// Older records, if their size is capped.
-const OLDER_RECORDS: &str = "records-1.jsonl";
+pub(super) const OLDER_RECORDS: &str = "records-1.jsonl";
 /// Holds the files of the previous run until the new one has a frame.
 const PREVIOUS: &str = ".previous";
 /// Scene of the run.

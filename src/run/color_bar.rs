@@ -1,6 +1,10 @@
 //! The colours of a picture by FTLE, for a colour bar beside it.
 
-use crate::render::{Film, Renderer};
+use super::Settings;
+use super::record::{DomainRecord, FrameRecord};
+use super::setup::assemble;
+use crate::field::Domain;
+use crate::render::{Film, Renderer, Scene, TransferSettings};
 use serde::{Deserialize, Serialize};
 
 /// Colours of a bar.
@@ -32,6 +36,23 @@ impl ColorBar {
         let colors = film.tone_mapped(renderer.scene().settings.tone_map).as_chunks().0.to_vec();
         let unit = if time_unit.is_empty() { String::new() } else { format!("1/{time_unit}") };
         Self { colors, low, high, unit }
+    }
+
+    /// Colours of a frame by its record and the scene of its run.
+    ///
+    /// # Errors
+    /// What the record lacks, since an earlier version wrote it, or why it does not fit the scene.
+    pub fn of(settings: &Settings, record: &FrameRecord) -> Result<Self, String> {
+        let FrameRecord { camera: Some(camera), domain: Some(DomainRecord { min, max, axes }), transfer, .. } = record else {
+            return Err("lacks `camera` or `domain`, which earlier versions did not write".into());
+        };
+        let domain = Domain { dimensions: axes.len(), ..Domain::cuboid(*min, *max) };
+        let mut scene = Scene { camera: camera.clone(), scale: record.scale, ..assemble(settings, &domain) };
+        [scene.settings.width, scene.settings.height] = record.size;
+        let (low, high, extinction) = (Some(transfer.low), Some(transfer.high), Some(transfer.extinction));
+        scene.transfer = TransferSettings { low, high, extinction, ..scene.transfer };
+        let renderer = Renderer::new(scene, &domain, record.tau).map_err(|error| format!("does not fit the scene: {error}"))?;
+        Ok(Self::new(&renderer, [transfer.low, transfer.high], &record.time_unit))
     }
 }
 

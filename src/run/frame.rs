@@ -3,13 +3,15 @@
 use super::assess::{Work, assess};
 use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
-use super::record::Frame;
+use super::record::{DomainRecord, Frame};
+use super::setup::Plan;
 use super::slides::{Slide, Slides};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
 use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, Surrogate};
+use crate::field::Domain;
 use crate::flow::VelocitySource;
 use crate::progress;
 use crate::render::smooth::AUDIT_PAIRS;
@@ -360,6 +362,7 @@ impl Run<'_> {
             tolerance: self.learning.trust.tolerance(),
             camera: Some(self.renderer.scene().camera.clone()),
             scale: self.renderer.scene().scale,
+            domain: Some(domain_record(self.plan, slide)),
             commands: std::mem::take(&mut self.progress.commands),
             traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,
             integration_steps: fixed_steps(flow).map(|steps| steps as u64),
@@ -374,4 +377,17 @@ impl Run<'_> {
             ..FrameRecord::default()
         }
     }
+}
+
+/// Box of the seeds, with the axes of the data.
+fn domain_record(plan: &Plan, slide: &Slide) -> DomainRecord {
+    let Domain { min, max, dimensions, .. } = plan.domain;
+    let axis = |k: usize| match &slide.velocity {
+        VelocitySource::Window(window) => {
+            window.grid().and_then(|grid| grid.axes.get(k)).map(|a| [a.name().to_owned(), a.units().to_owned()])
+        }
+        VelocitySource::Analytic(..) => None,
+    };
+    let axes = (0..dimensions).map(|k| axis(k).unwrap_or_else(|| [["x", "y", "z"][k].to_owned(), String::new()]));
+    DomainRecord { min, max, axes: axes.collect() }
 }

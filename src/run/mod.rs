@@ -29,7 +29,7 @@ pub use checkpoints::CheckpointTotals;
 pub use color_bar::ColorBar;
 pub use cycle::{Event, RunOptions, RunReport, run, run_on};
 pub use error::RunError;
-pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
+pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub(crate) use setup::auto_steps;

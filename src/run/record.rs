@@ -37,6 +37,9 @@ pub struct FrameRecord {
     /// Scene units of `camera` per unit of the domain's coordinates, along each axis.
     #[serde(default)]
     pub scale: [f64; 3],
+    /// Box of the seeds, which the picture shows. `None` in records of earlier versions.
+    #[serde(default)]
+    pub domain: Option<DomainRecord>,
     /// Commands that this frame is the first to show.
     #[serde(default)]
     pub commands: Vec<Command>,
@@ -114,6 +117,17 @@ pub struct FrameRecord {
     pub seconds: StageSeconds,
     /// Warnings since the last frame.
     pub warnings: Vec<String>,
+}
+
+/// Box of the seeds, in the coordinates of the data.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+pub struct DomainRecord {
+    /// Lower corner; of two dimensions with the slab of the picture.
+    pub min: [f64; 3],
+    /// Upper corner.
+    pub max: [f64; 3],
+    /// Name and unit of each axis along which the flow varies; units are empty if there are none.
+    pub axes: Vec<[String; 2]>,
 }
 
 /// Transfer function. By default `low` and `high` are the median and the 99.5th percentile of the FTLE on stratified points of the domain at the

@@ -2,8 +2,11 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report, and figures are printed.
 
 mod command;
+mod figure;
+mod geometry;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod pixels;
 mod projections;
 mod ridges;
+mod surfaces;

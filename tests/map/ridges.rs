@@ -13,7 +13,7 @@ fn field(origin: [f64; 2], step: f64, size: [usize; 2], of: impl Fn(f64, f64) ->
     Field { origin, step: [step; 2], size, values: (0..size[0] * size[1]).map(value).collect(), scale: vec![[1.0; 2]; size[1]] }
 }
 
-const ALL: Strength = Strength { percentile: 0.0, length: 5.0, smoothing: 0.0 };
+const ALL: Strength = Strength { percentile: 0.0, sharpness: 0.0, extent: 5.0, smoothing: 0.0 };
 
 /// FTLE of u = sin x, v = -y over tau: tan(X / 2) = e^tau tan(x / 2), so that dX/dx = e^tau / (cos^2 (x/2) + e^(2 tau) sin^2 (x/2)). Its ridge is x = 0.
 fn nonlinear_saddle(x: f64, tau: f64) -> f64 {
@@ -105,8 +105,8 @@ fn curved_ridges_close_and_filters_choose() {
     }
     let count = |strength: Strength| squeezed.ridges(&strength).len();
     assert_eq!(count(Strength { percentile: 90.0, ..ALL }), 1, "the weaker one is below the percentile");
-    assert_eq!(count(Strength { length: 120.0, ..ALL }), 1, "the shorter one has 78 nodes");
-    assert_eq!(count(Strength { length: 400.0, ..ALL }), 0);
+    assert_eq!(count(Strength { extent: 120.0, ..ALL }), 1, "the shorter one has 78 nodes");
+    assert_eq!(count(Strength { extent: 400.0, ..ALL }), 0);
     // A hole cuts the circle open.
     squeezed.values[50 * 101 + 50 + 35] = f32::NAN;
     let cut = squeezed.ridges(&ALL);
@@ -138,7 +138,7 @@ fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
             .map(|k| DomainPoint([(step * (k % size[0]) as f64) as f32, (step * (k / size[0]) as f64) as f32, 0.5]))
             .collect();
         let values = stretches(&trace(&velocity, &map, 0.0, &seeds, Extras::default())).iter().map(|s| (s / 10.0) as f32).collect();
-        let strength = Strength { percentile: 80.0, length: 0.1 * n as f64, smoothing: 0.0 };
+        let strength = Strength { percentile: 80.0, extent: 0.1 * n as f64, ..ALL };
         Field { origin: [0.0; 2], step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] }.ridges(&strength)
     };
     let (coarse, fine) = (ridges(100), ridges(400));

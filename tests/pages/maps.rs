@@ -28,9 +28,13 @@ fn every_field_of_the_record_has_its_row() {
 #[test]
 fn every_option_is_on_the_page() {
     let page = page("maps.md");
-    for option in fields("src/cli/map.rs", "Options") {
+    let commands = ["map", "ridges", "figure"];
+    for option in commands.iter().flat_map(|command| fields(&format!("src/cli/{command}.rs"), "Options")) {
         let option = option.replace('_', "-");
-        assert!(option == "paths" || option == "out" || page.contains(&format!("--{option}")), "docs/maps.md has no --{option}");
+        assert!(
+            ["paths", "run", "out"].contains(&option.as_str()) || page.contains(&format!("--{option}")),
+            "docs/maps.md has no --{option}"
+        );
     }
     for kind in ["polar", "plate_carree", "lambert", "mercator", "plain"] {
         assert!(page.contains(&format!("| `{kind}`")), "docs/maps.md has no {kind}");

@@ -1,9 +1,9 @@
-//! Fields as VTK XML files with appended raw arrays ("VTK File Formats", vtk.org), and `.pvd` collections of several times.
+//! Fields as VTK XML files, and `.pvd` collections of several times.
 
 use super::{Field, FieldFrame, failed};
 use crate::field::Geometry;
-use crate::folder::Folder;
 use crate::publish::PublishError;
+use crate::publish::vtk_xml::{Appended, Array, begin, escaped};
 use std::fmt::Write as _;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -42,32 +42,6 @@ pub(super) struct VtkFiles {
     series: bool,
     /// Times and names of the files of a series.
     written: Vec<(f64, String)>,
-}
-
-/// An array of a file: its declaration, and values in the order of the file.
-struct Array<'a> {
-    name: &'static str,
-    number: &'static str,
-    components: usize,
-    tuples: usize,
-    values: Box<dyn Iterator<Item = [u8; 8]> + 'a>,
-    /// Bytes of a value.
-    width: usize,
-}
-
-impl<'a> Array<'a> {
-    fn doubles(name: &'static str, components: usize, tuples: usize, values: impl Iterator<Item = f64> + 'a) -> Self {
-        Self { name, number: "Float64", components, tuples, values: Box::new(values.map(f64::to_le_bytes)), width: 8 }
-    }
-
-    fn bytes(name: &'static str, tuples: usize, values: impl Iterator<Item = i8> + 'a) -> Self {
-        let wide = |value: i8| [value as u8, 0, 0, 0, 0, 0, 0, 0];
-        Self { name, number: "Int8", components: 1, tuples, values: Box::new(values.map(wide)), width: 1 }
-    }
-
-    fn length(&self) -> u64 {
-        (self.components * self.tuples * self.width) as u64
-    }
 }
 
 impl VtkFiles {
@@ -113,9 +87,7 @@ impl VtkFiles {
     }
 
     fn file(&self, path: &Path, field: &Field) -> io::Result<()> {
-        let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no file name"))?;
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        Folder::open(folder)?.write_with(name, |file| {
+        crate::files::write_with(path, |file| {
             let mut out = BufWriter::with_capacity(1 << 20, file);
             self.write(&mut out, field)?;
             out.flush()
@@ -126,12 +98,11 @@ impl VtkFiles {
         let frame = &self.frame;
         let [nx, ny, nz] = frame.grid;
         let seeds = nx * ny * nz;
-        let number = |name: &'static str, value: f64| Array::doubles(name, 1, 1, std::iter::once(value));
         let facts = vec![
-            number("TimeValue", field.time),
-            number("integration_time", frame.tau),
-            number("direction", frame.direction.sign()),
-            number("ftle_error_of_steps", field.error_of_steps.unwrap_or(f64::NAN)),
+            Array::number("TimeValue", field.time),
+            Array::number("integration_time", frame.tau),
+            Array::number("direction", frame.direction.sign()),
+            Array::number("ftle_error_of_steps", field.error_of_steps.unwrap_or(f64::NAN)),
         ];
         let finite = |value: f64| if value.is_finite() { value } else { f64::NAN };
         let mut points = vec![Array::doubles("ftle", 1, seeds, field.ftle.iter().map(move |&v| finite(v)))];
@@ -158,37 +129,18 @@ impl VtkFiles {
         let extent = format!("0 {} 0 {} 0 {}", nx - 1, ny - 1, nz - 1);
         let spacing = |k: usize| axes[k].get(1).map_or(1.0, |second| second - axes[k][0]);
         let (kind, title) = (self.kind.name(), format!("{}; {}", frame.title, frame.source));
-        writeln!(
-            out,
-            "<?xml version=\"1.0\"?>\n<!-- {} FTLE of {}, by ridgewatch {} -->",
-            frame.direction.name(),
-            comment(&title),
-            env!("CARGO_PKG_VERSION")
-        )?;
-        writeln!(out, "<VTKFile type=\"{kind}\" version=\"1.0\" byte_order=\"LittleEndian\" header_type=\"UInt64\">")?;
+        begin(out, kind, &format!("{} FTLE of {title}", frame.direction.name()))?;
         write!(out, "<{kind} WholeExtent=\"{extent}\"")?;
         if self.kind == VtkKind::Image {
             let [x, y, z] = [0, 1, 2].map(|k| axes[k][0]);
             write!(out, " Origin=\"{x} {y} {z}\" Spacing=\"{} {} {}\"", spacing(0), spacing(1), spacing(2))?;
         }
         writeln!(out, ">")?;
-        let mut offset = 0;
-        let mut declare = |out: &mut dyn Write, arrays: &[Array], counted: &str| {
-            arrays.iter().try_for_each(|array| {
-                let Array { name, number, components, tuples, .. } = array;
-                let tuples = if counted.is_empty() { String::new() } else { format!(" {counted}=\"{tuples}\"") };
-                writeln!(
-                    out,
-                    "<DataArray type=\"{number}\" Name=\"{name}\" NumberOfComponents=\"{components}\"{tuples} format=\"appended\" offset=\"{offset}\"/>"
-                )?;
-                offset += 8 + array.length();
-                io::Result::Ok(())
-            })
-        };
+        let mut appended = Appended::default();
         writeln!(out, "<FieldData>")?;
-        declare(out, &facts, "NumberOfTuples")?;
+        appended.declare(out, facts, true)?;
         writeln!(out, "</FieldData>\n<Piece Extent=\"{extent}\">\n<PointData Scalars=\"ftle\">")?;
-        declare(out, &points, "")?;
+        appended.declare(out, points, false)?;
         writeln!(out, "</PointData>")?;
         let around = match self.kind {
             VtkKind::Image => None,
@@ -197,18 +149,11 @@ impl VtkFiles {
         };
         if let Some(around) = around {
             writeln!(out, "<{around}>")?;
-            declare(out, &grid, "")?;
+            appended.declare(out, grid, false)?;
             writeln!(out, "</{around}>")?;
         }
-        write!(out, "</Piece>\n</{kind}>\n<AppendedData encoding=\"raw\">\n_")?;
-        for array in facts.into_iter().chain(points).chain(grid) {
-            out.write_all(&array.length().to_le_bytes())?;
-            let width = array.width;
-            for value in array.values {
-                out.write_all(&value[..width])?;
-            }
-        }
-        write!(out, "\n</AppendedData>\n</VTKFile>\n")
+        writeln!(out, "</Piece>\n</{kind}>")?;
+        appended.finish(out)
     }
 }
 
@@ -221,13 +166,4 @@ fn in_space(geometry: Geometry, [x, y, z]: [f64; 3]) -> [f64; 3] {
             [cos_y * cos_x, cos_y * sin_x, sin_y].map(|e| e * (radius + z))
         }
     }
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
-}
-
-/// Text inside an XML comment, which ends at two dashes.
-fn comment(text: &str) -> String {
-    text.replace("--", "- -").trim_end_matches('-').chars().filter(|c| !c.is_control()).collect()
 }

@@ -1,0 +1,206 @@
+//! Height-ridge surfaces of a field in space: points at which the field is largest across the surface (Eberly, Ridges in image and data analysis, 1996;
+//! for the FTLE Sadlo and Peikert, Efficient visualization of Lagrangian coherent structures by filtered AMR ridge extraction, IEEE TVCG 13, 2007).
+//!
+//! With g the gradient, H the Hessian and e its unit eigenvector of the smallest eigenvalue: g . e = 0, and that eigenvalue is negative and the largest
+//! one by magnitude. Cells are cut into six tetrahedra around a diagonal, whose corners agree on the sign of e (Furst and Pizer, Marching ridges, 2001).
+//! The place of a crossing depends on its edge alone, so that tetrahedra meet in shared vertices without gaps.
+
+use super::pieces::pieces;
+use super::ridges::{Strength, cubic_zero, least_sharpness, percentile};
+use super::volume::{Shape, Shapes, Volume};
+use rayon::prelude::*;
+
+/// A vertex of a ridge surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SurfacePoint {
+    /// Coordinates.
+    pub place: [f64; 3],
+    /// The (smoothed) field.
+    pub value: f64,
+    /// Minus the second derivative across the surface, per square of the unit of [`Volume::scale`].
+    pub sharpness: f64,
+}
+
+/// Ridge surfaces as one triangle mesh with shared vertices.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Surfaces {
+    /// Vertices.
+    pub points: Vec<SurfacePoint>,
+    /// Vertices of each triangle. Triangles of a surface lie together and turn the same way round, if the surface has two sides.
+    pub triangles: Vec<[u32; 3]>,
+    /// What each surface is, the largest first.
+    pub surfaces: Vec<Surface>,
+}
+
+/// A connected surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Surface {
+    /// Number of its triangles.
+    pub triangles: usize,
+    /// Area, in squares of nodes.
+    pub area: f64,
+    /// Mean of the field over the area.
+    pub mean: f64,
+}
+
+/// Corners of a cell, as bits of x, y and z, of the tetrahedra around its diagonal.
+const TETRAHEDRA: [[usize; 4]; 6] = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]];
+
+/// Vertices and triangles before they are filtered.
+struct Mesh {
+    /// Numbers of the vertices on the edges that begin in the layer of cells and in the one above, eight places a node.
+    numbers: [Vec<u32>; 2],
+    points: Vec<SurfacePoint>,
+    triangles: Vec<[u32; 3]>,
+}
+
+/// An edge whose crossing was not looked for yet, and one whose point is no ridge.
+const NEW: u32 = u32::MAX;
+const NONE: u32 = u32::MAX - 1;
+
+impl Volume {
+    /// Ridge surfaces.
+    pub fn surfaces(&self, strength: &Strength) -> Surfaces {
+        let shapes = self.shapes(strength.smoothing);
+        let mut known: Vec<f64> = shapes.smooth.iter().copied().filter(|v| v.is_finite()).collect();
+        if known.is_empty() || self.size.iter().any(|n| *n < 2) {
+            return Surfaces::default();
+        }
+        known.par_sort_unstable_by(f64::total_cmp);
+        let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
+        drop(known);
+        let [nx, ny, nz] = self.size;
+        let layer = || vec![NEW; 8 * nx * ny];
+        let mut mesh = Mesh { numbers: [layer(), layer()], points: Vec::new(), triangles: Vec::new() };
+        for k in 0..nz - 1 {
+            for cell in 0..(nx - 1) * (ny - 1) {
+                self.cut([cell % (nx - 1), cell / (nx - 1), k], &shapes, faint, &mut mesh);
+            }
+            mesh.numbers.swap(0, 1);
+            mesh.numbers[1].fill(NEW);
+        }
+        let Mesh { points, mut triangles, .. } = mesh;
+        let sharp = least_sharpness(points.iter().map(|point| point.sharpness), strength.sharpness);
+        triangles.retain(|triangle| triangle.iter().all(|n| points[*n as usize].sharpness >= sharp));
+        let mut kept: Vec<(Surface, Vec<[u32; 3]>)> = pieces(&triangles)
+            .into_par_iter()
+            .map(|piece| (self.measured(&points, &piece), piece))
+            .filter(|(surface, _)| surface.area >= strength.extent && surface.mean >= least)
+            .collect();
+        kept.sort_by(|(a, _), (b, _)| b.area.total_cmp(&a.area));
+        let mut found = Surfaces::default();
+        let mut numbers = vec![u32::MAX; points.len()];
+        for (surface, piece) in kept {
+            found.surfaces.push(surface);
+            found.triangles.extend(piece.into_iter().map(|triangle| {
+                triangle.map(|old| {
+                    let number = &mut numbers[old as usize];
+                    if *number == u32::MAX {
+                        *number = found.points.len() as u32;
+                        found.points.push(points[old as usize]);
+                    }
+                    *number
+                })
+            }));
+        }
+        found
+    }
+
+    /// Area and mean of triangles.
+    fn measured(&self, points: &[SurfacePoint], triangles: &[[u32; 3]]) -> Surface {
+        let (mut area, mut sum) = (0.0, 0.0);
+        for triangle in triangles {
+            let [a, b, c] = triangle.map(|n| points[n as usize]);
+            let side = |to: SurfacePoint| -> [f64; 3] { std::array::from_fn(|k| (to.place[k] - a.place[k]) / self.step[k]) };
+            let ([ux, uy, uz], [vx, vy, vz]) = (side(b), side(c));
+            let normal = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
+            let part = normal.iter().map(|c| c * c).sum::<f64>().sqrt() / 2.0;
+            area += part;
+            sum += part * (a.value + b.value + c.value) / 3.0;
+        }
+        Surface { triangles: triangles.len(), area, mean: sum / area }
+    }
+
+    /// Adds the triangles of a cell.
+    fn cut(&self, [i, j, k]: [usize; 3], shapes: &Shapes, faint: f64, mesh: &mut Mesh) {
+        let [nx, ny, _] = self.size;
+        let node = |corner: usize| (i + (corner & 1)) + nx * ((j + (corner >> 1 & 1)) + ny * (k + (corner >> 2)));
+        // All tetrahedra have both ends of the diagonal.
+        let (Some(first), Some(_)) = (&shapes.at[node(0)], &shapes.at[node(7)]) else { return };
+        for corners in TETRAHEDRA {
+            let [Some(a), Some(b), Some(c), Some(d)] = corners.map(|corner| shapes.at[node(corner)]) else { continue };
+            let all = [a, b, c, d];
+            // Edges on which directions differ by 60 degrees or more belong to no common ridge. Below, the signs cannot contradict each other.
+            let pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)];
+            if pairs.iter().any(|(p, q)| dot(all[*p].across, all[*q].across).abs() <= 0.5) {
+                continue;
+            }
+            let (mut below, mut above) = ([0; 4], [0; 4]);
+            let mut count = [0; 2];
+            for (corner, shape) in corners.into_iter().zip(&all) {
+                let (side, list) = if slope(shape, first) < 0.0 { (0, &mut below) } else { (1, &mut above) };
+                list[count[side]] = corner;
+                count[side] += 1;
+            }
+            let mut vertex = |p: usize, q: usize| {
+                let (from, to) = (p.min(q), p.max(q));
+                let place = 8 * (node(from) % (nx * ny)) + (p ^ q);
+                let number = mesh.numbers[from >> 2][place];
+                if number != NEW {
+                    return (number != NONE).then_some(number);
+                }
+                let point = self.crossing(node(from), node(to), p ^ q, shapes).filter(|point| point.value >= faint);
+                // Seven edges a node, of at most 2^24 nodes.
+                mesh.numbers[from >> 2][place] = if point.is_some() { mesh.points.len() as u32 } else { NONE };
+                mesh.points.extend(point);
+                point.map(|_| mesh.points.len() as u32 - 1)
+            };
+            let ring = match count {
+                [1, 3] => [vertex(below[0], above[0]), vertex(below[0], above[1]), vertex(below[0], above[2]), None],
+                [3, 1] => [vertex(below[0], above[0]), vertex(below[1], above[0]), vertex(below[2], above[0]), None],
+                [2, 2] => [vertex(below[0], above[0]), vertex(below[0], above[1]), vertex(below[1], above[1]), vertex(below[1], above[0])],
+                _ => continue,
+            };
+            for triangle in [[ring[0], ring[1], ring[2]], [ring[0], ring[2], ring[3]]] {
+                if let [Some(p), Some(q), Some(r)] = triangle {
+                    mesh.triangles.push([p, q, r]);
+                }
+            }
+        }
+    }
+
+    /// Zero of the slope on an edge, by the cubic through four nodes in a row, else linear. `None` where the smallest eigenvalue is not the largest by
+    /// magnitude.
+    fn crossing(&self, from: usize, to: usize, axes: usize, shapes: &Shapes) -> Option<SurfacePoint> {
+        let (a, b) = (shapes.at[from].as_ref()?, shapes.at[to].as_ref()?);
+        let (low, high) = (a.slope, slope(b, a));
+        let stride = to - from;
+        // Beyond faces of the grid, nodes in a row belong to other rows; but nodes on faces have no shape.
+        let beyond = |node: Option<usize>| {
+            let shape = shapes.at.get(node?)?.as_ref()?;
+            (dot(shape.across, a.across).abs() > 0.5).then(|| slope(shape, a))
+        };
+        let t = match (beyond(from.checked_sub(stride)), beyond(Some(to + stride))) {
+            (Some(before), Some(after)) => cubic_zero([before, low, high, after]),
+            _ => low / (low - high),
+        };
+        let between = |a: f64, b: f64| a + t * (b - a);
+        if between(a.balance, b.balance) > 0.0 {
+            return None;
+        }
+        let [nx, ny, _] = self.size;
+        let start = [from % nx, from / nx % ny, from / (nx * ny)];
+        let place = std::array::from_fn(|k| self.origin[k] + self.step[k] * (start[k] as f64 + if axes >> k & 1 == 1 { t } else { 0.0 }));
+        let value = between(shapes.smooth[from], shapes.smooth[to]);
+        Some(SurfacePoint { place, value, sharpness: -between(a.curvature, b.curvature) })
+    }
+}
+
+fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Slope in the direction of another node.
+fn slope(shape: &Shape, direction: &Shape) -> f64 {
+    shape.slope * dot(shape.across, direction.across).signum()
+}
