@@ -144,11 +144,13 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
         return Ok(([(CONTENT_TYPE, metrics::MEDIA_TYPE)], hub.metrics()).into_response());
     }
     let asks_for = File::named(path);
-    if path.ends_with("/values") || asks_for.is_some() {
+    let asks_for_plane = path.ends_with("/plane");
+    if path.ends_with("/values") || asks_for_plane || asks_for.is_some() {
         access.check_origin(&parts.headers)?;
         access.check_token(&parts.uri)?;
         return Ok(match asks_for {
             Some(file) => hub.pixels.download(file, &parts.uri).await,
+            None if asks_for_plane => hub.pixels.plane(&parts.uri).await,
             None => hub.pixels.values(&parts.uri),
         });
     }

@@ -3,11 +3,12 @@ import { Charts, rowOf } from "./charts.js";
 import { ColourBar } from "./colour_bar.js";
 import { Connection } from "./connection.js";
 import { Records } from "./history.js";
+import { Overlay } from "./overlay.js";
 import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, asker, download, pixelAt } from "./values.js";
+import { Values, asker, download, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -36,6 +37,8 @@ const values = new Values({
   ask: asker(token),
   show: (text, hint = "") => { setText(element("values"), text); element("values").title = hint; },
 });
+
+const overlay = new Overlay({ ask: planeAsker(token), canvas: element("overlay"), root: element("overlaying") });
 
 let connection;
 let newest = null;
@@ -99,6 +102,7 @@ function receiveState(state) {
   server = state;
   steering.receiveState(state);
   values.receiveState(state);
+  overlay.receiveState(state);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 
@@ -146,6 +150,7 @@ function pictureChanged(shown) {
   charts.mark(picture.held ? shown.frame : null);
   values.frame = heldFrame();
   values.changed();
+  overlay.look(heldFrame(), newest?.frame ?? null);
 }
 
 /** Number of the frame that is looked back at; null while the newest is followed. */
@@ -293,6 +298,7 @@ const KEYS = {
   ArrowRight: () => step(1),
   Home: () => picture.lookBack(0),
   End: () => picture.follow(),
+  o: () => overlay.cycle(element("overlay-of")),
   f: toggleFullScreen,
   t: switchTheme,
   "?": () => element("help").showModal(),
@@ -333,6 +339,11 @@ for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.bu
 element("method").addEventListener("change", ({ target }) => {
   steering.command({ "render.method": target.value });
   // Its keys are shortcuts again, and a method that is refused is not shown.
+  target.blur();
+});
+element("overlay-of").addEventListener("change", ({ target }) => {
+  overlay.choose(target.value);
+  // Its keys are shortcuts again.
   target.blur();
 });
 for (const id of ["low", "high"]) {
