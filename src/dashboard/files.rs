@@ -25,6 +25,7 @@ const FILES: &[File] = &[
     file!("charts.js", SCRIPT),
     file!("colour_bar.js", SCRIPT),
     file!("connection.js", SCRIPT),
+    file!("histogram.js", SCRIPT),
     file!("history.js", SCRIPT),
     file!("overlay.js", SCRIPT),
     file!("page.js", SCRIPT),

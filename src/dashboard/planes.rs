@@ -3,7 +3,7 @@
 use super::access::parameter;
 use super::hub::message;
 use super::pixels::{Pixels, Refusal, Sent, bad, refused};
-use crate::publish::{Layer, plane};
+use crate::publish::{Layer, histogram, plane};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
@@ -21,6 +21,14 @@ impl Pixels {
     /// Answers with a layer of a frame as a message: length and JSON of its [head](crate::publish::PlaneHead), then its values.
     pub async fn plane(&self, uri: &Uri) -> Response {
         self.encoded_plane(uri).await.unwrap_or_else(refused)
+    }
+
+    /// Answers with how often the frame shows each FTLE, as JSON.
+    pub fn histogram(&self, uri: &Uri) -> Response {
+        let counted = self.frame(uri).and_then(|(frame, _)| {
+            serde_json::to_string(&histogram(&frame)).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
+        });
+        counted.map_or_else(refused, |json| ([(CONTENT_TYPE, "application/json")], json).into_response())
     }
 
     async fn encoded_plane(&self, uri: &Uri) -> Result<Response, Refusal> {

@@ -70,6 +70,30 @@ fn a_plane_has_the_layer_of_the_film() {
     assert!(status == 404 && answer.contains("with --dashboard the run serves them"), "{answer}");
 }
 
+#[test]
+fn the_histogram_counts_the_pixels_of_the_frame() {
+    let film = film([9, 4], true);
+    let (stage, newest) = stage(Some(frame(12, film.clone())));
+    let target = format!("/histogram?token={}", stage.token);
+    let (status, answer) = get(stage.address(), &target, &[]);
+    let found: serde_json::Value = serde_json::from_str(body(&answer)).unwrap();
+    // One of the pixels has no value.
+    let known: Vec<f64> = film.ftle_mean.iter().copied().map(f64::from).filter(|value| value.is_finite()).collect();
+    let (low, high) = known.iter().fold((f64::MAX, f64::MIN), |(low, high), value| (low.min(*value), high.max(*value)));
+    assert_eq!((status, &found["frame"], &found["pixels"], &found["unit"]), (200, &json!(12), &json!(36), &json!("1/day")));
+    assert_eq!(found["range"], json!([low, high]));
+    let mut counts = vec![0; 64];
+    known.iter().for_each(|value| counts[(((value - low) / (high - low) * 64.0) as usize).min(63)] += 1);
+    assert_eq!(found["counts"], json!(counts));
+    newest.put(frame(13, Film::new(9, 4)));
+    let (_, answer) = get(stage.address(), &target, &[]);
+    let found: serde_json::Value = serde_json::from_str(body(&answer)).unwrap();
+    assert!(found["range"].is_null() && found["frame"] == 13);
+    assert_eq!(get(stage.address(), &format!("{target}&frame=12"), &[]).0, 410);
+    let alone = Stage::new();
+    assert_eq!(get(alone.address(), &format!("/histogram?token={}", alone.token), &[]).0, 404);
+}
+
 /// Those who take their planes slowly keep others from planes, and from nothing else.
 #[test]
 fn large_planes_are_thinned_and_few_are_on_their_way() {

@@ -134,7 +134,7 @@ fn frames_go_to_those_who_know_a_token() {
     let (stage, _newest) = stage(Some(frame(1, film([9, 4], true))));
     let address = stage.address();
     let watching = stage.dashboard.watching_url().split("token=").nth(1).unwrap().to_owned();
-    for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/frame.exr?", "/frame.png?", "/frame.json?"] {
+    for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/histogram?", "/frame.exr?", "/frame.png?", "/frame.json?"] {
         assert_eq!(get(address, &format!("{target}token={watching}"), &[]).0, 200, "{target}");
         assert_eq!(get(address, &format!("{target}token={}", stage.token), &[]).0, 200, "{target}");
         for wrong in ["", "token=", "token=0", &format!("token={watching}0")] {

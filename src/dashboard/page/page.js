@@ -2,13 +2,14 @@
 import { Charts, rowOf } from "./charts.js";
 import { ColourBar } from "./colour_bar.js";
 import { Connection } from "./connection.js";
+import { Histogram } from "./histogram.js";
 import { Records } from "./history.js";
 import { Overlay } from "./overlay.js";
 import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, asker, download, pixelAt, planeAsker } from "./values.js";
+import { Values, asker, download, histogramAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -39,6 +40,11 @@ const values = new Values({
 });
 
 const overlay = new Overlay({ ask: planeAsker(token), canvas: element("overlay"), root: element("overlaying") });
+const histogram = new Histogram({
+  root: element("histogram"),
+  ask: histogramAsker(token),
+  change: (range) => steering.command({ transfer: range }),
+});
 
 let connection;
 let newest = null;
@@ -103,6 +109,7 @@ function receiveState(state) {
   steering.receiveState(state);
   values.receiveState(state);
   overlay.receiveState(state);
+  histogram.receiveState(state);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 
@@ -251,6 +258,7 @@ function showSteering() {
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
   }
   setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
+  if (can && !document.hidden) histogram.refresh(newest, picture.kept.list.at(-1)?.header.color_bar?.colors);
 }
 
 async function save(ending) {

@@ -102,6 +102,9 @@ async function get(url, limit) {
 /** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */
 export const planeAsker = (token) => async (query) => (await get(address("plane", token, query), PLANE_LIMIT)).arrayBuffer();
 
+/** A function that asks for the counts of the FTLE. */
+export const histogramAsker = (token) => async () => (await get(address("histogram", token, {}), LIMIT)).json();
+
 /** A function for `ask`. */
 export const asker = (token) => async (query) => {
   try {
