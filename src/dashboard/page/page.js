@@ -257,7 +257,7 @@ function showSteering() {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
   }
-  setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
+  setText(element("ways"), steering.flat ? "Drag moves, the wheel or two fingers zoom, a double click goes home." : "Drag turns, shift-drag or two fingers move, the wheel or two fingers zoom, a double click goes home.");
   if (can && !document.hidden) histogram.refresh(newest, picture.kept.list.at(-1)?.header.color_bar?.colors);
 }
 
