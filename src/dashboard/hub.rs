@@ -402,7 +402,7 @@ pub(super) fn answer(number: u64, answer: &Answer) -> Bytes {
 }
 
 /// A message to the page: the length of the JSON as a little-endian u32, the JSON, and a picture.
-fn message(json: &str, picture: &[u8]) -> Bytes {
+pub(super) fn message(json: &str, picture: &[u8]) -> Bytes {
     // Our own JSON is shorter than 2^32.
     let length = u32::try_from(json.len()).unwrap_or(u32::MAX);
     [&length.to_le_bytes(), json.as_bytes(), picture].concat().into()

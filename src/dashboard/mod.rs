@@ -3,7 +3,7 @@
 //! In: the messages of a publisher, over ZeroMQ, and commands of browsers. Out: one page and a WebSocket, over HTTP, and the commands to the run.
 //! Calls `publish` for the names of messages, `steer` for commands, and the crate `ridgewatch-zmtp`.
 //!
-//! One thread does all of it but the encoding of files. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
+//! One thread does all of it but the encoding of files and planes. A picture is forwarded as it was encoded. A browser gets the newest picture when it has drawn the one before, so
 //! that none waits for another one and no queue grows behind it.
 
 mod access;
@@ -13,6 +13,7 @@ mod files;
 mod hub;
 mod metrics;
 mod pixels;
+mod planes;
 mod server;
 mod steering;
 mod token;

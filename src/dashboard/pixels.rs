@@ -1,7 +1,8 @@
 //! Pixels of the newest frame of the run in this process, and that frame as a file.
 
 use super::access::parameter;
-use crate::publish::{NewestFrame, NoFrame, channels_at, encode_exr, png};
+use super::planes::MAX_PLANES;
+use crate::publish::{NewestFrame, NoFrame, channels_at, encode_exr, no_error, png};
 use crate::run::Frame;
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -34,6 +35,7 @@ pub(super) enum Kept<'a> {
 pub(super) struct Pixels {
     newest: Option<Arc<NewestFrame>>,
     downloads: Arc<Semaphore>,
+    pub(super) planes: Arc<Semaphore>,
 }
 
 /// A file that a frame is sent as.
@@ -45,7 +47,25 @@ pub(super) enum File {
 }
 
 /// A request that is not met: status and words.
-type Refusal = (StatusCode, String);
+pub(super) type Refusal = (StatusCode, String);
+
+/// Bytes of an answer, and the right to send it until all are sent.
+pub(super) struct Sent<T> {
+    bytes: T,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl<T> Sent<T> {
+    pub fn new(bytes: T, permit: OwnedSemaphorePermit) -> Self {
+        Self { bytes, _permit: permit }
+    }
+}
+
+impl<T: AsRef<[u8]>> AsRef<[u8]> for Sent<T> {
+    fn as_ref(&self) -> &[u8] {
+        self.bytes.as_ref()
+    }
+}
 
 impl File {
     /// The file that a path asks for.
@@ -74,7 +94,7 @@ impl File {
 
 impl Pixels {
     pub fn new(newest: Option<Arc<NewestFrame>>) -> Self {
-        Self { newest, downloads: Arc::new(Semaphore::new(MAX_DOWNLOADS)) }
+        Self { newest, downloads: Arc::new(Semaphore::new(MAX_DOWNLOADS)), planes: Arc::new(Semaphore::new(MAX_PLANES)) }
     }
 
     pub fn kept(&self) -> Kept<'_> {
@@ -82,7 +102,7 @@ impl Pixels {
     }
 
     /// The frame that a query asks for by its number, or the newest one, and the name of its run.
-    fn frame(&self, uri: &Uri) -> Result<(Frame, &str), Refusal> {
+    pub(super) fn frame(&self, uri: &Uri) -> Result<(Frame, &str), Refusal> {
         let newest = self.newest.as_ref().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
         let wanted =
             parameter(uri, "frame").map(|text| whole("frame", text, "the number of a frame, or none for the newest")).transpose()?;
@@ -116,7 +136,9 @@ impl Pixels {
             #[serde(skip_serializing_if = "Option::is_none")]
             no_error: Option<String>,
         }
-        let (Frame { film, record, color_bar, .. }, _) = self.frame(uri)?;
+        let (frame, _) = self.frame(uri)?;
+        let no_error = no_error(&frame);
+        let Frame { film, record, color_bar, .. } = frame;
         let at = |name: &str, end: usize| {
             let accepted = format!("a pixel of the picture, 0 to {}", end.saturating_sub(1));
             let text = parameter(uri, name).unwrap_or_default();
@@ -126,8 +148,6 @@ impl Pixels {
         let (x, y) = (at("x", film.width)?, at("y", film.height)?);
         let channels: Map<String, Value> =
             channels_at(&film, [x, y]).into_iter().map(|(name, value)| (name.to_owned(), value.into())).collect();
-        let no_error =
-            (!channels.contains_key("error")).then(|| format!("{} states no error of a pixel; marched and two_level do", record.method));
         let unit = color_bar.as_ref().map_or("", |bar| bar.unit.as_str());
         let values = Values { frame: record.frame, slide: record.slide, x, y, size: record.size, channels, unit, no_error };
         serde_json::to_string(&values).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
@@ -139,16 +159,6 @@ impl Pixels {
     }
 
     async fn encoded(&self, file: File, uri: &Uri) -> Result<Response, Refusal> {
-        /// Bytes of a file, and the right to send it until all are sent.
-        struct Sent {
-            bytes: Vec<u8>,
-            _permit: OwnedSemaphorePermit,
-        }
-        impl AsRef<[u8]> for Sent {
-            fn as_ref(&self) -> &[u8] {
-                &self.bytes
-            }
-        }
         let busy = |_| (StatusCode::SERVICE_UNAVAILABLE, "another file is on its way: try again when it has arrived".to_owned());
         let permit = Arc::clone(&self.downloads).try_acquire_owned().map_err(busy)?;
         let (frame, run) = self.frame(uri)?;
@@ -163,19 +173,16 @@ impl Pixels {
         let failed = |error: String| (StatusCode::INTERNAL_SERVER_ERROR, format!("{name} cannot be made: {error}"));
         let bytes = encoded.map_err(|error| failed(error.to_string()))?.map_err(failed)?;
         let disposition = format!("attachment; filename=\"{name}\"");
-        Ok((
-            [(CONTENT_TYPE, media_type.to_owned()), (CONTENT_DISPOSITION, disposition)],
-            Bytes::from_owner(Sent { bytes, _permit: permit }),
-        )
+        Ok(([(CONTENT_TYPE, media_type.to_owned()), (CONTENT_DISPOSITION, disposition)], Bytes::from_owner(Sent::new(bytes, permit)))
             .into_response())
     }
 }
 
-fn refused((status, words): Refusal) -> Response {
+pub(super) fn refused((status, words): Refusal) -> Response {
     (status, words + "\n").into_response()
 }
 
-fn bad(name: &str, found: &str, accepted: &str) -> Refusal {
+pub(super) fn bad(name: &str, found: &str, accepted: &str) -> Refusal {
     let found: String = found.chars().take(32).collect();
     (StatusCode::BAD_REQUEST, format!("`{name}` is \"{found}\"; accepted: {accepted}"))
 }

@@ -108,6 +108,25 @@ async fn answer(request: Request, access: &Access, hub: Arc<Hub>) -> Response {
     response
 }
 
+/// What is served of the newest frame.
+enum OfFrames {
+    File(File),
+    Plane,
+    Histogram,
+    Values,
+}
+
+impl OfFrames {
+    fn named(path: &str) -> Option<Self> {
+        match path.rsplit('/').next() {
+            Some("plane") => Some(Self::Plane),
+            Some("histogram") => Some(Self::Histogram),
+            Some("values") => Some(Self::Values),
+            _ => File::named(path).map(Self::File),
+        }
+    }
+}
+
 /// Answers by the end of the path, since some proxies put a prefix before it.
 async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Response, Refused> {
     let (mut parts, _) = request.into_parts();
@@ -143,13 +162,14 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
         access.check_token_or_bearer(&parts.uri, &parts.headers)?;
         return Ok(([(CONTENT_TYPE, metrics::MEDIA_TYPE)], hub.metrics()).into_response());
     }
-    let asks_for = File::named(path);
-    if path.ends_with("/values") || asks_for.is_some() {
+    if let Some(wanted) = OfFrames::named(path) {
         access.check_origin(&parts.headers)?;
         access.check_token(&parts.uri)?;
-        return Ok(match asks_for {
-            Some(file) => hub.pixels.download(file, &parts.uri).await,
-            None => hub.pixels.values(&parts.uri),
+        return Ok(match wanted {
+            OfFrames::File(file) => hub.pixels.download(file, &parts.uri).await,
+            OfFrames::Plane => hub.pixels.plane(&parts.uri).await,
+            OfFrames::Histogram => hub.pixels.histogram(&parts.uri),
+            OfFrames::Values => hub.pixels.values(&parts.uri),
         });
     }
     Ok(match files::named(path) {

@@ -4,6 +4,7 @@
 #[path = "../kit/mod.rs"]
 mod kit;
 mod metrics;
+mod planes;
 mod program;
 mod steering;
 mod values;

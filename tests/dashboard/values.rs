@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// A film whose pixels all differ, with an error a pixel or without.
-fn film([width, height]: [usize; 2], has_error: bool) -> Film {
+pub fn film([width, height]: [usize; 2], has_error: bool) -> Film {
     let pixels = width * height;
     let layer = |from: f32| (0..pixels).map(|i| from + (i as f32).sqrt()).collect::<Vec<_>>();
     let mut film = Film { ftle_mean: layer(0.1), traced: layer(1.0), samples: vec![4.0; pixels], ..Film::new(width, height) };
@@ -26,24 +26,24 @@ fn film([width, height]: [usize; 2], has_error: bool) -> Film {
     film
 }
 
-fn frame(number: u64, film: Film) -> Frame {
+pub fn frame(number: u64, film: Film) -> Frame {
     let record = FrameRecord { frame: number, slide: 2, size: [film.width, film.height], method: "gated".into(), ..Default::default() };
     let bar = ColorBar { colors: vec![[1, 2, 3]; 32], low: 0.5, high: 2.0, unit: "1/day".into() };
     Frame { color_bar: Some(Arc::new(bar)), ..publishing::frame(record, film) }
 }
 
-fn stage(frame: Option<Frame>) -> (Stage, Arc<NewestFrame>) {
+pub fn stage(frame: Option<Frame>) -> (Stage, Arc<NewestFrame>) {
     let newest = Arc::new(NewestFrame::new(Path::new("out/gulf")));
     frame.into_iter().for_each(|frame| newest.put(frame));
     (Stage::with(tempfile::tempdir().unwrap(), None, Some(Arc::clone(&newest))), newest)
 }
 
-fn body(answer: &str) -> &str {
+pub fn body(answer: &str) -> &str {
     answer.split_once("\r\n\r\n").unwrap().1
 }
 
 /// Head and bytes of an answer.
-fn bytes(address: SocketAddr, target: &str) -> (String, Vec<u8>) {
+pub fn bytes(address: SocketAddr, target: &str) -> (String, Vec<u8>) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(LIMIT)).unwrap();
     write!(stream, "GET {target} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
@@ -134,7 +134,7 @@ fn frames_go_to_those_who_know_a_token() {
     let (stage, _newest) = stage(Some(frame(1, film([9, 4], true))));
     let address = stage.address();
     let watching = stage.dashboard.watching_url().split("token=").nth(1).unwrap().to_owned();
-    for target in ["/values?x=0&y=0&", "/frame.exr?", "/frame.png?", "/frame.json?"] {
+    for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/histogram?", "/frame.exr?", "/frame.png?", "/frame.json?"] {
         assert_eq!(get(address, &format!("{target}token={watching}"), &[]).0, 200, "{target}");
         assert_eq!(get(address, &format!("{target}token={}", stage.token), &[]).0, 200, "{target}");
         for wrong in ["", "token=", "token=0", &format!("token={watching}0")] {
@@ -196,7 +196,7 @@ fn one_file_is_on_its_way_at_once() {
     }
 }
 
-fn url(running: &Running) -> (SocketAddr, String) {
+pub fn url(running: &Running) -> (SocketAddr, String) {
     until("an address", || running.stdout().contains('}'));
     let printed: Value = serde_json::Deserializer::from_str(&running.stdout()).into_iter().next().unwrap().unwrap();
     let (address, token) = printed["url"].as_str().unwrap().strip_prefix("http://").unwrap().split_once("/?token=").unwrap();

@@ -52,7 +52,7 @@ pub struct Received {
 }
 
 impl Received {
-    fn of(bytes: &[u8]) -> Self {
+    pub fn of(bytes: &[u8]) -> Self {
         let length = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
         Self { json: serde_json::from_slice(&bytes[4..4 + length]).unwrap(), payload: bytes[4 + length..].to_vec() }
     }

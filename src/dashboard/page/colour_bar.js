@@ -15,7 +15,8 @@ export function ticks(low, high) {
   return Array.from({ length: last - first + 1 }, (_, index) => (first + index) * step);
 }
 
-function paint(canvas, colors) {
+/** Draws colours side by side. */
+export function paint(canvas, colors) {
   canvas.width = colors.length;
   canvas.height = 1;
   const image = new ImageData(colors.length, 1);
@@ -32,6 +33,9 @@ function tickLabel(value, { low, high }) {
   label.classList.toggle("last", share > 0.97);
   return label;
 }
+
+/** Labels round values of a range. */
+export const showTicks = (node, range) => node.replaceChildren(...ticks(range.low, range.high).map((value) => tickLabel(value, range)));
 
 function fallback(transfer) {
   if (!transfer) return "The frames carry no colour scale.";
@@ -57,6 +61,6 @@ export class ColourBar {
     paint(scale.querySelector("canvas"), bar.colors);
     scale.querySelector("canvas").setAttribute("aria-label", `Colours of FTLE from ${number(bar.low)} to ${number(bar.high)} ${unit}`);
     scale.querySelector("#scale-unit").textContent = `(${unit})`;
-    scale.querySelector("#scale-ticks").replaceChildren(...ticks(bar.low, bar.high).map((value) => tickLabel(value, bar)));
+    showTicks(scale.querySelector("#scale-ticks"), bar);
   }
 }

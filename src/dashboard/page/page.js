@@ -2,12 +2,14 @@
 import { Charts, rowOf } from "./charts.js";
 import { ColourBar } from "./colour_bar.js";
 import { Connection } from "./connection.js";
+import { Histogram } from "./histogram.js";
 import { Records } from "./history.js";
+import { Overlay } from "./overlay.js";
 import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, asker, download, pixelAt } from "./values.js";
+import { Values, asker, download, histogramAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -35,6 +37,13 @@ const steering = new Steering({
 const values = new Values({
   ask: asker(token),
   show: (text, hint = "") => { setText(element("values"), text); element("values").title = hint; },
+});
+
+const overlay = new Overlay({ ask: planeAsker(token), canvas: element("overlay"), root: element("overlaying") });
+const histogram = new Histogram({
+  root: element("histogram"),
+  ask: histogramAsker(token),
+  change: (range) => steering.command({ transfer: range }),
 });
 
 let connection;
@@ -99,6 +108,8 @@ function receiveState(state) {
   server = state;
   steering.receiveState(state);
   values.receiveState(state);
+  overlay.receiveState(state);
+  histogram.receiveState(state);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 
@@ -146,6 +157,7 @@ function pictureChanged(shown) {
   charts.mark(picture.held ? shown.frame : null);
   values.frame = heldFrame();
   values.changed();
+  overlay.look(heldFrame(), newest?.frame ?? null);
 }
 
 /** Number of the frame that is looked back at; null while the newest is followed. */
@@ -246,7 +258,8 @@ function showSteering() {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
   }
-  setText(element("ways"), steering.flat ? "Drag moves, the wheel zooms, a double click goes home." : "Drag turns, shift-drag moves, the wheel zooms, a double click goes home.");
+  setText(element("ways"), steering.flat ? "Drag moves, the wheel or two fingers zoom, a double click goes home." : "Drag turns, shift-drag or two fingers move, the wheel or two fingers zoom, a double click goes home.");
+  if (can && !document.hidden) histogram.refresh(newest, picture.kept.list.at(-1)?.header.color_bar?.colors);
 }
 
 async function save(ending) {
@@ -294,6 +307,7 @@ const KEYS = {
   ArrowRight: () => step(1),
   Home: () => picture.lookBack(0),
   End: () => picture.follow(),
+  o: () => overlay.cycle(element("overlay-of")),
   f: toggleFullScreen,
   t: switchTheme,
   "?": () => element("help").showModal(),
@@ -338,6 +352,11 @@ for (const [id, key] of [["method", "render.method"], ["direction", "time.direct
     target.blur();
   });
 }
+element("overlay-of").addEventListener("change", ({ target }) => {
+  overlay.choose(target.value);
+  // Its keys are shortcuts again.
+  target.blur();
+});
 for (const id of ["low", "high"]) {
   element(id).addEventListener("change", () => {
     const [low, high] = ["low", "high"].map((end) => element(end).valueAsNumber);

@@ -162,17 +162,35 @@ export const steeringKeys = (steering) => ({
   p: () => steering.togglePause(),
 });
 
+/** Middle and distance of the first two of some points. */
+function spanned(points) {
+  const [a, b = a] = points.values();
+  return { clientX: (a.x + b.x) / 2, clientY: (a.y + b.y) / 2, distance: Math.max(Math.hypot(a.x - b.x, a.y - b.y), 1) };
+}
+
 /** Lets the pointer steer on the picture. */
 export function steerBy(canvas, steering) {
   const shown = () => pictureBox(canvas);
+  /** A place of the window on the film: -1 to 1, from the left and the bottom. */
+  const onFilm = ({ clientX, clientY }) => {
+    const { width, height, left, top } = shown();
+    return [(2 * (clientX - left)) / width - 1, 1 - (2 * (clientY - top)) / height];
+  };
+  // Pointers that are down: two are fingers, which zoom and move.
+  const down = new Map();
   let last = null;
   canvas.addEventListener("pointerdown", (event) => {
     if (!steering.can || event.button > 2) return;
     event.preventDefault();
     canvas.setPointerCapture(event.pointerId);
-    last = { x: event.clientX, y: event.clientY, moves: event.shiftKey || event.button !== 0 };
+    down.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    last = down.size === 1 ? { x: event.clientX, y: event.clientY, moves: event.shiftKey || event.button !== 0 } : null;
   });
   canvas.addEventListener("pointermove", (event) => {
+    if (!down.has(event.pointerId)) return;
+    const before = spanned(down);
+    down.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (down.size === 2) pinch(before, spanned(down));
     if (last === null) return;
     const { width, height } = shown();
     const [across, upward] = [(event.clientX - last.x) / width, (last.y - event.clientY) / height];
@@ -180,16 +198,21 @@ export function steerBy(canvas, steering) {
     if (last.moves) steering.move(across, upward);
     else steering.turn(across, upward);
   });
-  for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, () => { last = null; });
+  // A finger that is left of two does not turn the view.
+  for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, (event) => { down.delete(event.pointerId); last = null; });
+  const pinch = (before, after) => {
+    const { width, height } = shown();
+    steering.zoom(before.distance / after.distance, onFilm(before));
+    steering.move((after.clientX - before.clientX) / width, (before.clientY - after.clientY) / height);
+  };
   canvas.addEventListener("contextmenu", (event) => steering.can && event.preventDefault());
   canvas.addEventListener("dblclick", () => steering.home());
   const turnWheel = (event) => {
     if (!steering.can) return;
     event.preventDefault();
-    const { width, height, left, top } = shown();
     // Lines and pages, which some browsers count instead of pixels.
     const pixels = event.deltaY * [1, 30, 300][event.deltaMode];
-    steering.zoom(Math.exp(WHEEL * pixels), [(2 * (event.clientX - left)) / width - 1, 1 - (2 * (event.clientY - top)) / height]);
+    steering.zoom(Math.exp(WHEEL * pixels), onFilm(event));
   };
   canvas.addEventListener("wheel", turnWheel, { passive: false });
 }

@@ -4,6 +4,7 @@ import { count, number, withUnit } from "./words.js";
 // Between two questions, so that a pointer on its way asks little.
 const SPACING = 50;
 const LIMIT = 5_000;
+const PLANE_LIMIT = 30_000;
 const DOWNLOAD_LIMIT = 600_000;
 
 /** The pixel of a picture at a place of the window; null outside. `box` is the rectangle in which the picture is drawn. */
@@ -97,6 +98,12 @@ async function get(url, limit) {
   if (!answer.ok) throw new Error((await answer.text()).trim() || `the server answers ${answer.status}`);
   return answer;
 }
+
+/** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */
+export const planeAsker = (token) => async (query) => (await get(address("plane", token, query), PLANE_LIMIT)).arrayBuffer();
+
+/** A function that asks for the counts of the FTLE. */
+export const histogramAsker = (token) => async () => (await get(address("histogram", token, {}), LIMIT)).json();
 
 /** A function for `ask`. */
 export const asker = (token) => async (query) => {

@@ -38,7 +38,7 @@ let complaints;
 beforeEach(() => { complaints = []; });
 
 async function open(address) {
-  const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, permissions: ["clipboard-read", "clipboard-write"] });
+  const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, hasTouch: true, permissions: ["clipboard-read", "clipboard-write"] });
   const page = await context.newPage();
   page.on("console", (message) => { if (["error", "warning"].includes(message.type())) complaints.push(message.text()); });
   page.on("pageerror", (error) => complaints.push(String(error)));
@@ -135,6 +135,56 @@ test("a map is moved and zoomed, and not turned", async () => {
     const near = await settled(where, page);
     assert.ok(near.field_of_view < moved.field_of_view && near.orthographic);
     await page.dblclick("#frame");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+  });
+});
+
+/** Two fingers that go from two places to two others, in shares of the picture. */
+async function pinch(page, from, to) {
+  const touch = await page.context().newCDPSession(page);
+  const box = await page.locator("#frame").boundingBox();
+  const send = (type, points) => touch.send("Input.dispatchTouchEvent", { type, touchPoints: points.map(([x, y], id) => ({ x: box.x + x * box.width, y: box.y + y * box.height, id })) });
+  await send("touchStart", [from[0]]);
+  await send("touchStart", from);
+  for (const share of [0.25, 0.5, 0.75, 1]) await send("touchMove", from.map((point, k) => point.map((value, axis) => value + share * (to[k][axis] - value))));
+  // The second finger stays for a moment, and does not turn the view.
+  await send("touchEnd", [to[1]]);
+  await send("touchMove", [[to[1][0] + 0.2, to[1][1]]]);
+  await send("touchEnd", []);
+}
+
+test("two fingers zoom and move: what is under them stays under them", async () => {
+  // The point of the scene at a share of the picture.
+  const at = ({ eye, look_at: look, field_of_view: angle }, [x, y]) => {
+    const half = Math.abs(eye[2] - look[2]) * Math.tan((angle * Math.PI) / 360);
+    return [look[0] + (2 * x - 1) * half, look[1] + ((1 - 2 * y) * half) / 2];
+  };
+  await steered("map", async (page, where) => {
+    await page.keyboard.press("0");
+    const home = await settled(where, page);
+    const [from, to] = [[[0.4, 0.6], [0.6, 0.6]], [[0.3, 0.4], [0.8, 0.4]]];
+    const { frame } = newest(where);
+    await pinch(page, from, to);
+    await commanded(where, frame, ["camera"]);
+    // Whole pixels of the window, twice.
+    await until("both fingers hold their points", () => from.every((point, k) => at(camera(where), to[k]).every((value, axis) => Math.abs(value - at(home, point)[axis]) < 0.02)));
+    const near = await settled(where, page);
+    assert.ok(from.every((point, k) => at(near, to[k]).every((value, axis) => Math.abs(value - at(home, point)[axis]) < 0.02)), "the finger that was left moved nothing");
+    assert.ok(Math.tan((near.field_of_view * Math.PI) / 360) / Math.tan((home.field_of_view * Math.PI) / 360) < 0.45);
+    await pinch(page, to, from);
+    await until("back again", () => Math.abs(camera(where).field_of_view - home.field_of_view) < 0.5);
+    await page.keyboard.press("0");
+    assert.ok(close((await settled(where, page)).eye, home.eye));
+  });
+  await steered("box", async (page, where) => {
+    await page.keyboard.press("0");
+    const home = await settled(where, page);
+    await pinch(page, [[0.4, 0.5], [0.6, 0.5]], [[0.35, 0.6], [0.65, 0.6]]);
+    await until("nearer", () => Math.abs(Math.hypot(...away(camera(where))) / Math.hypot(...away(home)) - 2 / 3) < 0.02);
+    const near = await settled(where, page);
+    // Moved, and not turned.
+    assert.ok(close(away(near).map((value) => value * Math.hypot(...away(home))), away(home).map((value) => value * Math.hypot(...away(near)))) && !close(near.look_at, home.look_at));
+    await page.keyboard.press("0");
     assert.ok(close((await settled(where, page)).eye, home.eye));
   });
 });
