@@ -23,7 +23,7 @@ pub struct Options {
     #[arg(long, value_name = "N")]
     frame: Option<u64>,
     /// Width of the page in pixels.
-    #[arg(long, default_value_t = 1200, value_name = "PIXELS", value_parser = clap::value_parser!(u64).range(320..=8192))]
+    #[arg(long, default_value_t = 1200, value_name = "PIXELS", value_parser = clap::value_parser!(u64).range(320..=4096))]
     width: u64,
 }
 

@@ -22,6 +22,8 @@ pub struct FramePage {
     words: Vec<String>,
     /// Width and height, in pixels.
     size: [f64; 2],
+    /// Those of the picture.
+    shown: [f64; 2],
     /// Size of the text, 1 for small pages.
     unit: f64,
 }
@@ -49,9 +51,12 @@ impl FramePage {
         };
         let unit = (width as f64 / 900.0).clamp(0.6, 5.0);
         let words = wrapped(&words(record), 13.0 * unit, width as f64 - 32.0 * unit)?;
-        let [columns, rows] = picture.size.map(|n| n as f64);
-        let shown = (width as f64 - 32.0 * unit) * rows / columns;
-        let height = 66.0 * unit + shown + 84.0 * unit + 17.0 * unit * words.len() as f64 + 8.0 * unit;
+        let [columns, rows] = picture.size.map(|n| n.max(1) as f64);
+        let room = width as f64 - 32.0 * unit;
+        // High ones are narrower than the page.
+        let scale = (room / columns).min(2.0 * room / rows);
+        let shown = [(columns * scale).round().max(1.0), (rows * scale).round().max(1.0)];
+        let height = 66.0 * unit + shown[1] + 84.0 * unit + 17.0 * unit * words.len() as f64 + 8.0 * unit;
         Ok(Self {
             picture,
             title: if title.is_empty() { what } else { title.to_owned() },
@@ -59,6 +64,7 @@ impl FramePage {
             bar,
             words,
             size: [width as f64, height.ceil()],
+            shown,
             unit,
         })
     }
@@ -84,10 +90,9 @@ impl FramePage {
         sheet_svg(self)
     }
 
-    /// Width and height of the picture on the page.
-    fn shown(&self) -> [f64; 2] {
-        let width = self.size[0] - 32.0 * self.unit;
-        [width, width * self.picture.size[1] as f64 / self.picture.size[0] as f64]
+    /// Upper left corner of the picture.
+    fn corner(&self) -> [f64; 2] {
+        [((self.size[0] - self.shown[0]) / 2.0).floor(), (66.0 * self.unit).floor()]
     }
 }
 
@@ -98,7 +103,7 @@ impl Sheet for FramePage {
 
     fn images(&self) -> Vec<Image<'_>> {
         let Picture { size, pixels } = &self.picture;
-        vec![Image { corner: [16.0 * self.unit, 66.0 * self.unit], shown: self.shown(), size: *size, pixels, is_smooth: true }]
+        vec![Image { corner: self.corner(), shown: self.shown, size: *size, pixels, is_smooth: true }]
     }
 
     fn draw<B: DrawingBackend>(&self, pen: &Pen<'_, B>) -> Result<(), DrawError> {
@@ -107,8 +112,9 @@ impl Sheet for FramePage {
         for (text, top, size) in [(&self.title, 12.0, 21.0), (&self.subtitle, 39.0, 16.0)] {
             pen.text(&pen.fitting(text, size * u, room)?, [16.0 * u, top * u], size * u, LEFT, FontTransform::None)?;
         }
-        let [right, bottom] = [width - 16.0 * u, 66.0 * u + self.shown()[1]];
-        let rim = [[16.0 * u, 66.0 * u], [right, 66.0 * u], [right, bottom], [16.0 * u, bottom], [16.0 * u, 66.0 * u]];
+        let [left, top] = self.corner();
+        let (right, bottom) = (left + self.shown[0], top + self.shown[1]);
+        let rim = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]];
         pen.line(&rim, [0.0; 2], BLACK.to_rgba(), 0.8 * u)?;
         let below = bottom + 10.0 * u;
         let bar = (room - 40.0 * u).min(560.0 * u);

@@ -11,7 +11,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 /// Longest line of the records that is read.
-const LINE: u64 = 1 << 24;
+const MAX_LINE_BYTES: u64 = 16 << 20;
 
 /// A run folder.
 #[derive(Debug)]
@@ -91,8 +91,10 @@ impl PastRun {
             let mut line = Vec::new();
             for number in 1.. {
                 line.clear();
-                let length =
-                    (&mut reader).take(LINE).read_until(b'\n', &mut line).map_err(|error| failed(format!("cannot be read: {error}")))?;
+                let length = (&mut reader)
+                    .take(MAX_LINE_BYTES)
+                    .read_until(b'\n', &mut line)
+                    .map_err(|error| failed(format!("cannot be read: {error}")))?;
                 if length == 0 {
                     break;
                 }
