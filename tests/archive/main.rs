@@ -11,6 +11,7 @@ mod netcdf;
 mod odd;
 mod parts;
 mod real;
+mod refined;
 mod refused;
 mod resampled;
 mod round_trip;

@@ -1,18 +1,18 @@
 //! Plan of files with longitudes and latitudes of two dimensions.
 
-use super::axes::{AxisPlan, Quantity};
+use super::axes::AxisPlan;
 use super::component::Role;
 use super::curvilinear::Curvilinear;
 use super::layout::{Layout, Resampling};
-use super::locator::{Locator, Mesh, target};
+use super::locator::{Mesh, target};
 use super::planner::Planner;
+use super::refine::Choice;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
 use crate::cf::velocity::Velocity;
 use crate::error::SourceError;
 use crate::formats::Variable;
-use ridgewatch_field::Axis;
 use std::sync::Arc;
 
 /// Longitude and latitude variables.
@@ -312,41 +312,24 @@ impl Planner<'_> {
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: Some(resampling), notes: self.notes })
     }
 
-    /// Makes the grid and locates its nodes among the points of each component.
+    /// Makes the grid, at the mesh's own spacing unless one is set, and locates its nodes among the points of each component.
     fn resample(&mut self, points: &[Points], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
         let mut meshes: Vec<Arc<Mesh>> = Vec::new();
-        // The first component with the same coordinates.
-        let twins: Vec<usize> = (0..points.len()).map(|k| points[..k].iter().position(|p| *p == points[k]).unwrap_or(k)).collect();
-        for (k, &twin) in twins.iter().enumerate() {
-            meshes.push(if twin < k { meshes[twin].clone() } else { Arc::new(self.mesh(&points[k])?) });
+        for (k, own) in points.iter().enumerate() {
+            // Components with the same coordinates share them.
+            let twin = points[..k].iter().position(|other| other == own);
+            meshes.push(twin.map_or_else(|| self.mesh(own).map(Arc::new), |twin| Ok(meshes[twin].clone()))?);
         }
-        let target = target(&meshes[0], self.settings.resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
-        let mut locators: Vec<Arc<Locator>> = Vec::new();
-        for (k, &twin) in twins.iter().enumerate() {
-            locators.push(if twin < k { locators[twin].clone() } else { Arc::new(Locator::new(&meshes[k], &target)) });
-        }
+        let resolution = self.settings.resolution;
+        let target = target(&meshes[0], resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
         let (along, why) = self.runs_along_grid(u);
         let directions = std::array::from_fn(|k| meshes[k].directions(along).into_iter().map(|both| both[k]).collect());
-        let names = points[0].pair.map(|i| self.variable(i).name.clone());
-        let what = format!(
-            "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
-            names[0], names[1], meshes[0].shape[0], meshes[0].shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
-        );
-        self.note(what.clone());
         let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
         self.note(format!("velocities run along {which} ({why})"));
-        let kinds = [(Kind::Longitude, "degrees_east"), (Kind::Latitude, "degrees_north")];
-        let mut axes = Vec::new();
-        for (k, (kind, units)) in kinds.into_iter().enumerate() {
-            let last = target.first[k] + target.step[k] * (target.nodes[k] - 1) as f64;
-            let axis = Axis::uniform(names[k].as_str(), units, target.first[k], last, target.nodes[k]);
-            let mut axis = axis.map_err(|fault| self.fault(fault))?;
-            if k == 0 && target.round && self.wants_periodic() {
-                axis = axis.with_period(360.0);
-            }
-            axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
-        }
-        let resampled = Curvilinear { locators, meshes, target, directions, bases: target.bases(), what };
-        Ok((Resampling::Curvilinear(Arc::new(resampled)), axes))
+        let names = points[0].pair.map(|i| self.variable(i).name.clone());
+        let choice = if resolution.is_some() { Choice::Set } else { Choice::Mesh { factor: 1.0, stopped: None } };
+        let resampled = Curvilinear::new(names, meshes, Arc::new(directions), target, choice);
+        let axes = resampled.axes(self.wants_periodic()).map_err(|fault| self.fault(fault))?;
+        Ok((Resampling::Curvilinear(Arc::new(resampled)), axes.to_vec()))
     }
 }

@@ -234,7 +234,7 @@ impl Staggered {
         Some((metres(0, x), metres(1, y), degrees))
     }
 
-    /// See [`super::layout::Resampling::error`].
+    /// Root mean squares over the points of the file, m/s: of the interpolation on the grid minus the file's values, and of the file's values.
     pub fn error(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
         let grid = self.on_own_cells(file, frame, entry)?;
         let full = self.full_levels(file, entry)?;
