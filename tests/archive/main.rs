@@ -15,6 +15,7 @@ mod refined;
 mod refused;
 mod resampled;
 mod round_trip;
+mod terrain;
 mod zarr;
 
 use ridgewatch::source::{Archive, ArchiveSettings, Inspection, SnapshotSource, SourceError, inspect};

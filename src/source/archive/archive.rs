@@ -12,10 +12,9 @@ use crate::cf::velocity::judge;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::georeference::Georeference;
-use crate::grids::read_component;
 use crate::grids::{
     AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, VelocityScale, ZERO, difference,
-    holds_mask, plan, slab_of,
+    holds_mask, plan, read_component, read_levels, slab_of,
 };
 use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -126,7 +125,9 @@ impl Archive {
                 }
                 Err(error) => return Err(error),
             };
-            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
+            let own_levels = layout.frames.iter().flatten().all(|component| component.columns.is_none());
+            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && own_levels && file.listing.format == Format::NetCdf4
+            {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
             let index = files.len();
@@ -297,7 +298,7 @@ impl Archive {
         let region = self.resampling.is_none().then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
         let points = |plan: &ComponentPlan| {
             let [x, y] = region.clone().unwrap_or_else(|| [0, 1].map(|k| (0..plan.along(k)).collect()));
-            [x, y, vec![level]]
+            [x, y, vec![level.min(plan.along(2) - 1)]]
         };
         // What cannot be read is reported when it is needed.
         let Ok(zeros) = self.zeros(points) else { return };
@@ -421,7 +422,7 @@ impl Archive {
         let plans = &self.files[place.file].frames[place.frame];
         let mut components = match resampling {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
-            None => plans.iter().map(|plan| read_component(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
+            None => plans.iter().map(|plan| read_levels(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
         };
         if !self.vertical.is_empty()
             && let Some(w) = components.get_mut(2)
@@ -563,7 +564,11 @@ const WINDOW: usize = 64;
 
 /// Compares what one snapshot needs with the memory that reading may need. The window is compared when a run is set up.
 fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), SourceError> {
-    let nodes = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
+    let on_grid = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
+    // Columns are read whole.
+    let whole = |c: &ComponentPlan| [0, 1, 2].iter().fold(1u64, |n, &k| n.saturating_mul(c.along(k) as u64));
+    let in_file = layout.frames[0].iter().filter(|c| c.columns.is_some()).map(whole).max().unwrap_or(0);
+    let nodes = on_grid.max(in_file);
     let what = limits.check(nodes.saturating_mul(NODE_BYTES), &format!("snapshots of {nodes} nodes"));
     what.map_err(|what| SourceError::file(path, what))
 }

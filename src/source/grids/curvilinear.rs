@@ -7,7 +7,7 @@
 //! there: east and north turn about a pole within a cell, vectors do not.
 
 use super::axes::{AxisPlan, Quantity};
-use super::component::{ComponentPlan, read_component};
+use super::component::{ComponentPlan, read_levels};
 use super::locator::{Locator, Mesh, Target};
 use super::refine::Choice;
 use crate::cf::coordinate::Kind;
@@ -69,11 +69,11 @@ impl Curvilinear {
         Ok([axis(0, Kind::Longitude, "degrees_east")?, axis(1, Kind::Latitude, "degrees_north")?])
     }
 
-    /// Reads one entry along time onto the grid. `levels` are the file's entries of the grid's levels.
+    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`read_levels`] counts them.
     pub fn read(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize, levels: &[usize]) -> Result<Vec<Vec<f32>>, SourceError> {
         let values = |which: usize| {
             let [x, y, _] = frame[which].file_order();
-            read_component(file, &frame[which], &[x, y, levels.to_vec()], entry)
+            read_levels(file, &frame[which], &[x, y, levels.to_vec()], entry)
         };
         let mut out = self.horizontal(&values(0)?, &values(1)?);
         if let Some(locator) = self.locators.get(2) {

@@ -1,6 +1,7 @@
 //! Plan of files with longitudes and latitudes of two dimensions.
 
 use super::axes::AxisPlan;
+use super::column_plan::Terrain;
 use super::component::Role;
 use super::curvilinear::Curvilinear;
 use super::layout::{Layout, Resampling};
@@ -10,7 +11,7 @@ use super::refine::Choice;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
-use crate::cf::velocity::Velocity;
+use crate::cf::velocity::{Candidate, Velocity};
 use crate::error::SourceError;
 use crate::formats::Variable;
 use std::sync::Arc;
@@ -258,21 +259,26 @@ impl Planner<'_> {
                 extent.kind = [Kind::Longitude, Kind::Latitude][k];
             }
         }
+        let terrain = self.terrain(velocity, &mut extents, first)?;
         self.name_by_position(u, &mut extents)?;
-        let level = self.pick_level(&extents)?;
+        let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
         let level_extent = extents.iter().find(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
-        let three = level_extent.is_some();
-        let metric = self.metric(&extents, three)?;
+        let three = terrain.as_ref().map_or(level_extent.is_some(), Terrain::is_three);
+        let metric = self.metric(&extents, three, terrain.is_some())?;
         if metric != Metric::Sphere {
             let what = "its levels are neither pressures nor lengths, which the sphere needs: pick one by its coordinate with --set \
                         archive.level=VALUE, or by its entry with --set archive.select.DIMENSION=0";
             return Err(self.misfit(u, what));
         }
-        let level_axis = level_extent.map(|e| self.axis(u, e, 2)).transpose()?;
+        let level_axis = match &terrain {
+            Some(terrain) => self.height_axis(terrain)?,
+            None => level_extent.map(|e| self.axis(u, e, 2)).transpose()?,
+        };
 
-        let role = |d: usize, plane: &[usize; 2]| match (plane.iter().position(|&t| t == d), level) {
+        let role = |which: usize, d: usize| match (planes[which].iter().position(|&t| t == d), level) {
             (Some(k), _) => Role::Axis(k),
+            (None, _) if terrain.as_ref().is_some_and(|t| t.is_along(which, d)) => Role::Axis(2),
             (None, Some((dimension, index))) if dimension == d => Role::Fixed(index),
             (None, _) => match self.measured(d).kind {
                 Kind::Time => Role::Time,
@@ -280,22 +286,24 @@ impl Planner<'_> {
                 _ => Role::Fixed(self.entry_of(d)),
             },
         };
-        let roles = |variable: usize, plane: &[usize; 2]| -> Vec<(usize, Role)> {
-            self.variable(variable).dimensions.iter().map(|&d| (d, role(d, plane))).collect()
+        let roles = |(which, candidate): (usize, &Candidate)| -> Vec<(usize, Role)> {
+            self.variable(candidate.variable).dimensions.iter().map(|&d| (d, role(which, d))).collect()
         };
         let candidates = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
-        let roles: Vec<Vec<(usize, Role)>> = candidates.zip(&planes).map(|(c, plane)| roles(c.variable, plane)).collect();
+        let roles: Vec<Vec<(usize, Role)>> = candidates.enumerate().map(roles).collect();
         let mut components = vec![self.component(&velocity.u, &roles[0], None)?, self.component(&velocity.v, &roles[1], None)?];
         let levels = [0, 1].map(|k| components[k].along(2));
         if levels[0] != levels[1] {
             return Err(self.misfit(velocity.v.variable, format!("u has {} levels, v {}", levels[0], levels[1])));
         }
-        let w = self.vertical_component(velocity.w.as_ref(), roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
+        let w = self.vertical_candidate(velocity, terrain.as_ref());
+        let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
         match w {
-            Some(w) if w.along(2) == levels[0] => components.push(w),
+            Some(w) if terrain.is_some() || w.along(2) == levels[0] => components.push(w),
             Some(w) => self.note(format!("`{}` lies on other levels than u: vertical motion is taken as 0", w.name)),
             None => {}
         }
+        self.give_columns(&mut components, terrain.as_ref())?;
 
         let points = &points[..components.len()];
         let same_shapes = |l: &&Layout| l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));

@@ -72,7 +72,7 @@ pub enum Resampling {
 }
 
 impl Resampling {
-    /// Reads one entry along time onto the grid. `levels` are the file's entries of the grid's levels, if the grid keeps them.
+    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`super::component::read_levels`] counts them.
     ///
     /// # Errors
     /// The values cannot be read.

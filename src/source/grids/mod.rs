@@ -8,6 +8,8 @@
 //! dimensions).
 
 mod axes;
+mod column;
+mod column_plan;
 mod component;
 mod content;
 mod curvilinear;
@@ -31,7 +33,7 @@ mod times;
 mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
-pub use component::{ComponentPlan, Orders, read_component};
+pub use component::{ComponentPlan, Orders, read_component, read_levels};
 pub use content::{Content, content};
 pub use land::Mask;
 pub use layout::{Layout, Resampling, difference};

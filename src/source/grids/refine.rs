@@ -4,7 +4,7 @@
 //! mesh itself (inverse bilinear, see [`super::curvilinear`]) on one snapshot: at the mesh's own points, and at places anywhere between
 //! them. The grid is refined until both errors are small, or a bound is reached.
 
-use super::component::{ComponentPlan, SquaredErrors, read_component};
+use super::component::{ComponentPlan, SquaredErrors, read_levels};
 use super::curvilinear::{Curvilinear, Vectors, locators};
 use super::locator::Target;
 use crate::error::SourceError;
@@ -136,10 +136,10 @@ impl Curvilinear {
     /// Reads the velocities at an entry along time, on a few levels or on all.
     pub fn truth(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize, all_levels: bool) -> Result<Truth, SourceError> {
         let values = |plan: &ComponentPlan| {
-            let [x, y, z] = plan.file_order();
-            let few = if all_levels { z.len() } else { z.len().min(MEASURED_LEVELS) };
-            let levels = (0..few).map(|k| if few > 1 { k * (z.len() - 1) / (few - 1) } else { 0 }).collect();
-            read_component(file, plan, &[x, y, levels], entry)
+            let ([x, y, _], all) = (plan.file_order(), plan.levels());
+            let few = if all_levels { all } else { all.min(MEASURED_LEVELS) };
+            let levels = (0..few).map(|k| if few > 1 { k * (all - 1) / (few - 1) } else { 0 }).collect();
+            read_levels(file, plan, &[x, y, levels], entry)
         };
         let own = [values(&frame[0])?, values(&frame[1])?];
         let places = self.target.between();
