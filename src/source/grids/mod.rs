@@ -5,7 +5,8 @@
 //! files that name their dimensions from files that do not.
 //!
 //! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan`, `staggered_plan` (WRF) and `datasets` (no named
-//! dimensions).
+//! dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation), and `refine` chooses
+//! how fine the grid of `curvilinear_plan` is.
 
 mod axes;
 mod column;
