@@ -153,7 +153,8 @@ pub struct ArchiveSettings {
     pub metric: Option<Metric>,
     /// Unit of the velocities.
     pub velocity_unit: VelocityUnit,
-    /// Reads only the level at this coordinate, in the file's unit: the flow becomes two-dimensional.
+    /// Reads only the level at this coordinate, in the file's unit (a height in metres if levels follow the bottom of the sea): the flow becomes
+    /// two-dimensional.
     pub level: Option<f64>,
     /// Part to read: `[x0, x1, y0, y1]` in the file's coordinates (longitudes may differ by 360 degrees).
     pub region: Option<[f64; 4]>,
@@ -172,11 +173,12 @@ pub struct ArchiveSettings {
     pub periodic: Option<String>,
     /// HDF5: time between the numbers in dataset or file names, 1 by default.
     pub time_step: Option<f64>,
-    /// WRF: heights of the grid in metres; by default the mean heights of its levels.
+    /// Levels that follow the terrain (WRF) or the bottom of the sea: heights of the grid in metres, negative below the surface of the sea; by default
+    /// the mean heights of the levels.
     pub heights: Option<Vec<f64>>,
     /// WRF: grid for the components on faces.
     pub staggering: Staggering,
-    /// Curvilinear longitudes and latitudes: spacing in degrees of the resampled grid; by default their median spacing.
+    /// Curvilinear longitudes and latitudes: spacing in degrees of the resampled grid; by default chosen by its error.
     pub resolution: Option<[f64; 2]>,
     /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
     /// decided by their standard names.

@@ -138,7 +138,12 @@ impl Coordinate {
                     new.conversion = Conversion::Pressure(scale);
                 } else if plan.quantity == Quantity::Length {
                     // Those of WRF are (PH + PHB) / g.
-                    let default = (variable.is_none() && plan.in_file.is_none() && new.name == "height").then_some("geopotential_height");
+                    let made = variable.is_none() && plan.in_file.is_none();
+                    let default = match new.name.as_str() {
+                        "height" if made => Some("geopotential_height"),
+                        "altitude" if made => Some("altitude"),
+                        _ => None,
+                    };
                     new.standard_name = named(&["depth", "height", "altitude", "geopotential_height"], default);
                     new.units = "m".into();
                     new.positive = Some(if down { "down" } else { "up" });

@@ -160,7 +160,8 @@ fn masks_at_faces() {
     let dir = tempdir().unwrap();
     let share = |masks: &[&str], toml: &str| {
         let file = roms(masks).write(&dir.path().join("roms.nc"));
-        let snapshot = open_with(&[file], toml).read(0).unwrap();
+        // By itself, the grid would be finer where the flow ends at a coast.
+        let snapshot = open_with(&[file], &format!("resolution = [0.05, 0.05]\n{toml}")).read(0).unwrap();
         // A resampled value beside the coast that is a mean with 0 is no land, and no current of the model either.
         let slow = snapshot.nodes.iter().filter(|n| !n[3].is_nan() && n[..3].iter().map(|v| v * v).sum::<f32>().sqrt() < 0.45).count();
         (snapshot.missing_nodes(), slow)

@@ -11,9 +11,11 @@ mod netcdf;
 mod odd;
 mod parts;
 mod real;
+mod refined;
 mod refused;
 mod resampled;
 mod round_trip;
+mod terrain;
 mod zarr;
 
 use ridgewatch::source::{Archive, ArchiveSettings, Inspection, SnapshotSource, SourceError, inspect};

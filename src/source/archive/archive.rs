@@ -12,10 +12,9 @@ use crate::cf::velocity::judge;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::georeference::Georeference;
-use crate::grids::read_component;
 use crate::grids::{
-    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, VelocityScale, ZERO, difference, holds_mask, plan,
-    slab_of,
+    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, VelocityScale, ZERO, difference,
+    holds_mask, plan, read_component, read_levels, slab_of,
 };
 use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -126,7 +125,9 @@ impl Archive {
                 }
                 Err(error) => return Err(error),
             };
-            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
+            let own_levels = layout.frames.iter().flatten().all(|component| component.columns.is_none());
+            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && own_levels && file.listing.format == Format::NetCdf4
+            {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
             let index = files.len();
@@ -189,7 +190,7 @@ impl Archive {
             }
             files.iter_mut().flat_map(|file| &mut file.frames).for_each(|frame| land.apply(frame));
         }
-        let grid = Arc::new(build_grid(&files[0].path, &layout, settings)?);
+        let grid = Arc::new(build_grid(&files[0].path, &layout.axes, layout.metric, settings)?);
         let description = describe(&layout, format, files.len(), &seconds);
         let names: Vec<String> = layout.frames.iter().flatten().map(|c| c.name.clone()).collect();
         let mut archive = Self {
@@ -227,11 +228,11 @@ impl Archive {
             None if land.found.iter().all(Option::is_none) && !staggered => archive.tell_zeros(),
             _ => {}
         }
-        if let Some([error, size]) = archive.resampling_error()? {
-            archive.description.notes.push(format!(
-                "resampling error, measured on the first snapshot at the file's own points: {error:.3} m/s of {size:.3} m/s ({:.1} %), root mean square",
-                100.0 * error / size.max(f64::MIN_POSITIVE)
-            ));
+        archive.refine(settings)?;
+        if let Some(error) = archive.resampling_error()? {
+            let notes = &mut archive.description.notes;
+            notes.push(format!("resampling error, measured on the first snapshot, root mean square: {error}"));
+            notes.extend(archive.resampling.as_ref().and_then(|resampling| resampling.warning(&error)));
         }
         Ok(archive)
     }
@@ -297,7 +298,7 @@ impl Archive {
         let region = self.resampling.is_none().then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
         let points = |plan: &ComponentPlan| {
             let [x, y] = region.clone().unwrap_or_else(|| [0, 1].map(|k| (0..plan.along(k)).collect()));
-            [x, y, vec![level]]
+            [x, y, vec![level.min(plan.along(2) - 1)]]
         };
         // What cannot be read is reported when it is needed.
         let Ok(zeros) = self.zeros(points) else { return };
@@ -421,7 +422,7 @@ impl Archive {
         let plans = &self.files[place.file].frames[place.frame];
         let mut components = match resampling {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
-            None => plans.iter().map(|plan| read_component(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
+            None => plans.iter().map(|plan| read_levels(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
         };
         if !self.vertical.is_empty()
             && let Some(w) = components.get_mut(2)
@@ -435,13 +436,41 @@ impl Archive {
         Ok(components)
     }
 
-    /// Description of the resampling, if any.
-    pub(super) fn resampled(&self) -> Option<&str> {
-        self.resampling.as_ref().map(Resampling::what)
+    /// Makes the grid that a mesh is resampled to fine enough, unless its resolution is set. Points on land have to be known.
+    fn refine(&mut self, settings: &ArchiveSettings) -> Result<(), SourceError> {
+        let Some(Resampling::Curvilinear(mesh)) = self.resampling.clone() else { return Ok(()) };
+        let mut refined = mesh.clone();
+        if settings.resolution.is_none() {
+            let levels = self.axes.get(2).map_or(1, |axis| axis.order.len());
+            // A snapshot while it is read, and a window, take half of the memory at most.
+            let held = self.times.len().min(WINDOW) * size_of::<[f32; 4]>();
+            let node = MESH_NODE_BYTES + (NODE_BYTES + held as u64) * levels as u64;
+            let most = self.limits.memory / 2 / node;
+            let Place { file: index, frame, entry } = self.open_at(0)?;
+            let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+            let truth = mesh.truth(file, &self.files[index].frames[frame], entry, false)?;
+            refined = mesh.refined(&truth, usize::try_from(most).unwrap_or(usize::MAX), levels);
+        }
+        self.description.notes.push(refined.what());
+        if !Arc::ptr_eq(&mesh, &refined) {
+            let path = &self.files[0].path;
+            let fault = |fault| SourceError::file(path, fault);
+            let [longitude, mut latitude] = refined.axes(settings.periodic.as_deref() != Some("none")).map_err(fault)?;
+            self.poles = Poles::close(&longitude, &mut latitude).map_err(fault)?;
+            (self.axes[0], self.axes[1]) = (longitude, latitude);
+            self.grid = Arc::new(build_grid(path, &self.axes, self.metric, settings)?);
+            self.resampling = Some(Resampling::Curvilinear(refined));
+        }
+        Ok(())
+    }
+
+    /// Description of the resampling, if any, and a warning if `error` is large.
+    pub(super) fn resampled(&self, error: &ResamplingError) -> Option<(String, Option<String>)> {
+        self.resampling.as_ref().map(|resampling| (resampling.what(), resampling.warning(error)))
     }
 
     /// Error of the resampling on the first snapshot, if anything is resampled. See [`Resampling::error`].
-    pub(super) fn resampling_error(&mut self) -> Result<Option<[f64; 2]>, SourceError> {
+    pub(super) fn resampling_error(&mut self) -> Result<Option<ResamplingError>, SourceError> {
         let Some(resampling) = self.resampling.clone() else { return Ok(None) };
         let Place { file: index, frame, entry } = self.open_at(0)?;
         let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
@@ -528,9 +557,18 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<
 /// Bytes of a node while a snapshot is read: a value of the file, in the library and converted; three components; the snapshot.
 const NODE_BYTES: u64 = 2 * 8 + 3 * 4 + 16;
 
+/// Bytes of a node of the grid that a mesh is resampled to: its places in three meshes, and east and north.
+const MESH_NODE_BYTES: u64 = 3 * 12 + 2 * 12;
+/// Most snapshots that a window is expected to hold when the grid of a mesh is chosen.
+const WINDOW: usize = 64;
+
 /// Compares what one snapshot needs with the memory that reading may need. The window is compared when a run is set up.
 fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), SourceError> {
-    let nodes = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
+    let on_grid = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
+    // Columns are read whole.
+    let whole = |c: &ComponentPlan| [0, 1, 2].iter().fold(1u64, |n, &k| n.saturating_mul(c.along(k) as u64));
+    let in_file = layout.frames[0].iter().filter(|c| c.columns.is_some()).map(whole).max().unwrap_or(0);
+    let nodes = on_grid.max(in_file);
     let what = limits.check(nodes.saturating_mul(NODE_BYTES), &format!("snapshots of {nodes} nodes"));
     what.map_err(|what| SourceError::file(path, what))
 }
@@ -597,18 +635,18 @@ fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: O
     }
 }
 
-fn build_grid(path: &Path, layout: &Layout, settings: &ArchiveSettings) -> Result<Grid, SourceError> {
+fn build_grid(path: &Path, axes: &[AxisPlan], metric: Metric, settings: &ArchiveSettings) -> Result<Grid, SourceError> {
     let index_axis = |plan: &AxisPlan| {
         let n = plan.axis.len();
         let axis = Axis::uniform(plan.axis.name(), "cells", 0.0, (n - 1) as f64, n).map_err(|fault| SourceError::file(path, fault))?;
         Ok(if plan.axis.period().is_some() { axis.with_period(n as f64) } else { axis })
     };
-    let axes: Vec<Axis> = match layout.metric {
-        Metric::Index => layout.axes.iter().map(index_axis).collect::<Result<_, SourceError>>()?,
-        Metric::Sphere | Metric::Cartesian => layout.axes.iter().map(|p| p.axis.clone()).collect(),
+    let axes: Vec<Axis> = match metric {
+        Metric::Index => axes.iter().map(index_axis).collect::<Result<_, SourceError>>()?,
+        Metric::Sphere | Metric::Cartesian => axes.iter().map(|p| p.axis.clone()).collect(),
     };
     let slab = settings.slab.map_or_else(|| slab_of(&axes), |[low, high]| (low, high));
-    let geometry = if layout.metric == Metric::Sphere { Geometry::Sphere { radius: EARTH_RADIUS } } else { Geometry::Cartesian };
+    let geometry = if metric == Metric::Sphere { Geometry::Sphere { radius: EARTH_RADIUS } } else { Geometry::Cartesian };
     Ok(Grid { axes, geometry, slab })
 }
 

@@ -58,6 +58,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         () if curvilinear => "longitudes and latitudes of two dimensions",
         () => format.name(),
     };
+    let terrain = staggered || layout.frames[0].iter().any(|component| component.columns.is_some());
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
         ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
@@ -65,7 +66,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         ("spacing", s.spacing.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
         ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
         ("time_step", s.time_step.is_some(), hdf5, "with HDF5 only; the times of NetCDF are in the file"),
-        ("heights", s.heights.is_some(), staggered, "with WRF output only"),
+        ("heights", s.heights.is_some(), terrain, "with levels that follow the terrain or the bottom of the sea only"),
         ("staggering", s.staggering != Staggering::default(), staggered, "with WRF output only"),
         ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),

@@ -8,7 +8,7 @@ use crate::archive_settings::ArchiveSettings;
 use crate::cf::velocity;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Listing};
-use crate::grids::{AxisPlan, InFile, Quantity, readable_axes};
+use crate::grids::{AxisPlan, InFile, Quantity, ResamplingError, readable_axes};
 use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, median_interval, span, window_snapshots};
 use ridgewatch_base::setting::{Refused, word};
 use serde::Serialize;
@@ -117,15 +117,20 @@ pub struct TimeReport {
     pub tau_problem: Option<String>,
 }
 
-/// Resampling and its error on the first snapshot, at the file's own points.
+/// Resampling and its error on the first snapshot.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ResamplingReport {
     /// Description.
     pub what: String,
-    /// Root mean square of the interpolation on the new grid minus the file's velocity, in m/s.
+    /// Root mean square of the interpolation on the new grid minus the file's velocity, at the file's own points, in m/s.
     pub error: f64,
+    /// Root mean square of the interpolation on the new grid minus interpolation in the mesh, between the file's points, in m/s. `None` if the
+    /// file has no mesh of longitudes and latitudes.
+    pub error_between: Option<f64>,
     /// Root mean square of the file's velocity, in m/s.
     pub velocity: f64,
+    /// A warning if the error is large, and what to write.
+    pub warning: Option<String>,
 }
 
 /// Missing values, measured on a few snapshots.
@@ -243,8 +248,11 @@ impl Inspection {
             self.axes.push(AxisReport::of(plan, role));
         }
         let error = archive.resampling_error()?;
-        self.resampling =
-            archive.resampled().zip(error).map(|(what, [error, velocity])| ResamplingReport { what: what.to_owned(), error, velocity });
+        self.resampling = error.and_then(|error| {
+            let (what, warning) = archive.resampled(&error)?;
+            let ResamplingError { at_points, between, velocity } = error;
+            Some(ResamplingReport { what, error: at_points, error_between: between, velocity, warning })
+        });
         self.time = Some(times(&archive, &description, steady, tau));
         let count = archive.times().len();
         let sampled = count.min(SAMPLED);
@@ -383,14 +391,20 @@ impl fmt::Display for Inspection {
             }
         }
         match &self.resampling {
-            Some(r) => writeln!(
-                f,
-                "\nresampling\n  error {} m/s of {} m/s ({:.2} %), root mean square at the file's own points\n  {}",
-                Short(r.error),
-                Short(r.velocity),
-                100.0 * r.error / r.velocity.max(f64::MIN_POSITIVE),
-                r.what
-            )?,
+            Some(r) => {
+                let share = |error: f64| 100.0 * error / r.velocity.max(f64::MIN_POSITIVE);
+                let (error, velocity) = (Short(r.error), Short(r.velocity));
+                write!(
+                    f,
+                    "\nresampling\n  error {error} m/s of {velocity} m/s ({:.2} %), root mean square at the file's own points",
+                    share(r.error)
+                )?;
+                if let Some(between) = r.error_between {
+                    write!(f, "; {} m/s ({:.2} %) between them, against interpolation in the mesh", Short(between), share(between))?;
+                }
+                writeln!(f, "\n  {}", r.what)?;
+                r.warning.iter().try_for_each(|warning| writeln!(f, "  {warning}"))?;
+            }
             None => writeln!(f, "\nresampling\n  none: nodes are the file's own")?,
         }
         if let Some(m) = &self.missing {

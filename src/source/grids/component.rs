@@ -1,6 +1,7 @@
 //! One component of the velocity in a file, and its values at one time.
 
 use super::axes::runs;
+use super::column::Columns;
 use super::land::Mask;
 use crate::cf::packing::Packing;
 use crate::error::SourceError;
@@ -34,12 +35,19 @@ pub struct ComponentPlan {
     pub of_water: bool,
     /// Its points on land.
     pub mask: Option<Arc<Mask>>,
+    /// Levels that follow the bottom, and the heights that they are interpolated to.
+    pub columns: Option<Arc<Columns>>,
 }
 
 impl ComponentPlan {
     /// Entries along an axis of the grid; 1 if it has no such axis.
     pub fn along(&self, axis: usize) -> usize {
         self.roles.iter().zip(&self.shape).find(|(role, _)| **role == Role::Axis(axis)).map_or(1, |(_, &n)| n)
+    }
+
+    /// Levels that [`read_levels`] counts.
+    pub fn levels(&self) -> usize {
+        self.columns.as_ref().map_or_else(|| self.along(2), |columns| columns.heights.len())
     }
 
     /// All entries in the order of the file.
@@ -108,6 +116,17 @@ pub fn read_component(file: &DataFile, component: &ComponentPlan, orders: &Order
         }
     }
     Ok(values)
+}
+
+/// The same with `orders[2]` along the levels of the grid: heights if the levels of the file follow the bottom, else entries of the file.
+///
+/// # Errors
+/// The values cannot be read.
+pub fn read_levels(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
+    match &component.columns {
+        Some(columns) => columns.read(file, component, orders, entry),
+        None => read_component(file, component, orders, entry),
+    }
 }
 
 /// Sums of squares of interpolated values against exact ones.

@@ -6,34 +6,74 @@
 //! cell contains the node. Each horizontal component is resampled from its own points as a vector in space, along its direction
 //! there: east and north turn about a pole within a cell, vectors do not.
 
-use super::component::{ComponentPlan, SquaredErrors, read_component};
+use super::axes::{AxisPlan, Quantity};
+use super::component::{ComponentPlan, read_levels};
 use super::locator::{Locator, Mesh, Target};
+use super::refine::Choice;
+use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
 use crate::formats::DataFile;
+use ridgewatch_field::{Axis, AxisFault};
 use std::sync::Arc;
 
 /// How to read a file of curvilinear coordinates.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Curvilinear {
-    /// Places of the grid's nodes among the points of each component.
-    pub locators: Vec<Arc<Locator>>,
+    /// Names of the longitudes and latitudes.
+    pub names: [String; 2],
     /// Points of each component.
     pub meshes: Vec<Arc<Mesh>>,
-    pub target: Target,
     /// Unit vectors along u and v, at each of their points.
-    pub directions: [Vec<[f32; 3]>; 2],
+    pub directions: Arc<[Vec<[f32; 3]>; 2]>,
+    pub target: Target,
+    /// Places of the grid's nodes among the points of each component.
+    pub locators: Vec<Arc<Locator>>,
     /// Unit vectors to the east and to the north, at each node of the grid.
     pub bases: [Vec<[f32; 3]>; 2],
-    /// Description of the resampling.
-    pub what: String,
+    /// Why the grid has this spacing.
+    pub choice: Choice,
 }
 
+/// Vectors in space: their components along x, y and z.
+pub type Vectors = [Vec<f32>; 3];
+
 impl Curvilinear {
-    /// Reads one entry along time onto the grid. `levels` are the file's entries of the grid's levels.
+    /// Locates the nodes of a grid among the points of each component. Components on the same points share their mesh.
+    pub fn new(names: [String; 2], meshes: Vec<Arc<Mesh>>, directions: Arc<[Vec<[f32; 3]>; 2]>, target: Target, choice: Choice) -> Self {
+        let locators = locators(&meshes, &target);
+        Self { names, meshes, directions, target, locators, bases: target.bases(), choice }
+    }
+
+    /// The same mesh on another grid.
+    pub fn on(&self, target: Target, choice: Choice) -> Self {
+        Self::new(self.names.clone(), self.meshes.clone(), self.directions.clone(), target, choice)
+    }
+
+    /// Description of the resampling.
+    pub fn what(&self) -> String {
+        let ([a, b], [mx, my], [nx, ny], [dx, dy]) = (&self.names, self.meshes[0].shape, self.target.nodes, self.target.step);
+        format!(
+            "`{a}` and `{b}` have two dimensions: resampled bilinearly from {mx} x {my} points to {nx} x {ny} nodes, every {dx:.4} x {dy:.4} \
+             degrees ({})",
+            self.choice
+        )
+    }
+
+    /// Longitudes and latitudes of the grid; longitudes that go round are periodic if `periodic` is set.
+    pub fn axes(&self, periodic: bool) -> Result<[AxisPlan; 2], AxisFault> {
+        let Target { first, step, nodes, round } = self.target;
+        let axis = |k: usize, kind: Kind, units: &str| {
+            let axis = Axis::uniform(self.names[k].as_str(), units, first[k], first[k] + step[k] * (nodes[k] - 1) as f64, nodes[k])?;
+            Ok(AxisPlan::made(kind, if k == 0 && round && periodic { axis.with_period(360.0) } else { axis }, Quantity::Angle))
+        };
+        Ok([axis(0, Kind::Longitude, "degrees_east")?, axis(1, Kind::Latitude, "degrees_north")?])
+    }
+
+    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`read_levels`] counts them.
     pub fn read(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize, levels: &[usize]) -> Result<Vec<Vec<f32>>, SourceError> {
         let values = |which: usize| {
             let [x, y, _] = frame[which].file_order();
-            read_component(file, &frame[which], &[x, y, levels.to_vec()], entry)
+            read_levels(file, &frame[which], &[x, y, levels.to_vec()], entry)
         };
         let mut out = self.horizontal(&values(0)?, &values(1)?);
         if let Some(locator) = self.locators.get(2) {
@@ -43,16 +83,9 @@ impl Curvilinear {
     }
 
     /// Eastward and northward velocities at the nodes of all levels.
-    fn horizontal(&self, u: &[f32], v: &[f32]) -> Vec<Vec<f32>> {
+    pub fn horizontal(&self, u: &[f32], v: &[f32]) -> Vec<Vec<f32>> {
         let mut out = vec![Vec::new(), Vec::new()];
-        for levels in u.chunks_exact(self.locators[0].points()).zip(v.chunks_exact(self.locators[1].points())) {
-            let along: [Vec<f32>; 3] = std::array::from_fn(|k| {
-                let part = |which: usize, level: &[f32]| {
-                    let part: Vec<f32> = level.iter().zip(&self.directions[which]).map(|(value, d)| value * d[k]).collect();
-                    self.locators[which].apply(&part)
-                };
-                part(0, levels.0).iter().zip(part(1, levels.1)).map(|(a, b)| a + b).collect()
-            });
+        for along in self.vectors(&self.locators, u, v) {
             for (values, base) in out.iter_mut().zip(&self.bases) {
                 values.extend(base.iter().enumerate().map(|(node, e)| (0..3).map(|k| e[k] * along[k][node]).sum::<f32>()));
             }
@@ -60,27 +93,26 @@ impl Curvilinear {
         out
     }
 
-    /// See [`super::layout::Resampling::error`]. Interpolates vectors, as the flow is sampled.
-    pub fn error(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
-        let mut own = Vec::with_capacity(2);
-        for plan in &frame[..2] {
-            own.push(read_component(file, plan, &plan.file_order(), entry)?);
-        }
-        let on_grid = self.horizontal(&own[0], &own[1]);
-        let nodes = self.bases[0].len();
-        let mut sums = SquaredErrors::default();
-        for (level, (east, north)) in on_grid[0].chunks_exact(nodes).zip(on_grid[1].chunks_exact(nodes)).enumerate() {
-            let along: [Vec<f32>; 3] =
-                std::array::from_fn(|k| (0..nodes).map(|n| east[n] * self.bases[0][n][k] + north[n] * self.bases[1][n][k]).collect());
-            for which in 0..2 {
-                let (mesh, points) = (&self.meshes[which], self.locators[which].points());
-                for (point, &value) in own[which][level * points..][..points].iter().enumerate() {
-                    let at = |k: usize| self.target.interpolate(&along[k], mesh.longitude[point], mesh.latitude[point]);
-                    let found: f64 = (0..3).map(|k| at(k) * f64::from(self.directions[which][point][k])).sum();
-                    sums.add(found, value.into());
-                }
-            }
-        }
-        Ok(sums.root_mean_squares())
+    /// Velocities, level after level, at places that `locators` have located.
+    pub fn vectors<'a>(&'a self, locators: &'a [Arc<Locator>], u: &'a [f32], v: &'a [f32]) -> impl Iterator<Item = Vectors> + 'a {
+        u.chunks_exact(locators[0].points()).zip(v.chunks_exact(locators[1].points())).map(move |levels| {
+            std::array::from_fn(|k| {
+                let part = |which: usize, level: &[f32]| {
+                    let part: Vec<f32> = level.iter().zip(&self.directions[which]).map(|(value, d)| value * d[k]).collect();
+                    locators[which].apply(&part)
+                };
+                part(0, levels.0).iter().zip(part(1, levels.1)).map(|(a, b)| a + b).collect()
+            })
+        })
     }
+}
+
+/// Places of a grid's nodes among the points of each component.
+pub fn locators(meshes: &[Arc<Mesh>], target: &Target) -> Vec<Arc<Locator>> {
+    let mut found: Vec<Arc<Locator>> = Vec::new();
+    for (k, mesh) in meshes.iter().enumerate() {
+        let twin = meshes[..k].iter().position(|other| Arc::ptr_eq(other, mesh));
+        found.push(twin.map_or_else(|| Arc::new(Locator::new(mesh, target)), |twin| found[twin].clone()));
+    }
+    found
 }

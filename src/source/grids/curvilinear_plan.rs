@@ -1,18 +1,19 @@
 //! Plan of files with longitudes and latitudes of two dimensions.
 
-use super::axes::{AxisPlan, Quantity};
+use super::axes::AxisPlan;
+use super::column_plan::Terrain;
 use super::component::Role;
 use super::curvilinear::Curvilinear;
 use super::layout::{Layout, Resampling};
-use super::locator::{Locator, Mesh, target};
+use super::locator::{Mesh, target};
 use super::planner::Planner;
+use super::refine::Choice;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
-use crate::cf::velocity::Velocity;
+use crate::cf::velocity::{Candidate, Velocity};
 use crate::error::SourceError;
 use crate::formats::Variable;
-use ridgewatch_field::Axis;
 use std::sync::Arc;
 
 /// Longitude and latitude variables.
@@ -258,21 +259,26 @@ impl Planner<'_> {
                 extent.kind = [Kind::Longitude, Kind::Latitude][k];
             }
         }
+        let terrain = self.terrain(velocity, &mut extents, first)?;
         self.name_by_position(u, &mut extents)?;
-        let level = self.pick_level(&extents)?;
+        let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
         let level_extent = extents.iter().find(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
-        let three = level_extent.is_some();
-        let metric = self.metric(&extents, three)?;
+        let three = terrain.as_ref().map_or(level_extent.is_some(), Terrain::is_three);
+        let metric = self.metric(&extents, three, terrain.is_some())?;
         if metric != Metric::Sphere {
             let what = "its levels are neither pressures nor lengths, which the sphere needs: pick one by its coordinate with --set \
                         archive.level=VALUE, or by its entry with --set archive.select.DIMENSION=0";
             return Err(self.misfit(u, what));
         }
-        let level_axis = level_extent.map(|e| self.axis(u, e, 2)).transpose()?;
+        let level_axis = match &terrain {
+            Some(terrain) => self.height_axis(terrain)?,
+            None => level_extent.map(|e| self.axis(u, e, 2)).transpose()?,
+        };
 
-        let role = |d: usize, plane: &[usize; 2]| match (plane.iter().position(|&t| t == d), level) {
+        let role = |which: usize, d: usize| match (planes[which].iter().position(|&t| t == d), level) {
             (Some(k), _) => Role::Axis(k),
+            (None, _) if terrain.as_ref().is_some_and(|t| t.is_along(which, d)) => Role::Axis(2),
             (None, Some((dimension, index))) if dimension == d => Role::Fixed(index),
             (None, _) => match self.measured(d).kind {
                 Kind::Time => Role::Time,
@@ -280,22 +286,24 @@ impl Planner<'_> {
                 _ => Role::Fixed(self.entry_of(d)),
             },
         };
-        let roles = |variable: usize, plane: &[usize; 2]| -> Vec<(usize, Role)> {
-            self.variable(variable).dimensions.iter().map(|&d| (d, role(d, plane))).collect()
+        let roles = |(which, candidate): (usize, &Candidate)| -> Vec<(usize, Role)> {
+            self.variable(candidate.variable).dimensions.iter().map(|&d| (d, role(which, d))).collect()
         };
         let candidates = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
-        let roles: Vec<Vec<(usize, Role)>> = candidates.zip(&planes).map(|(c, plane)| roles(c.variable, plane)).collect();
+        let roles: Vec<Vec<(usize, Role)>> = candidates.enumerate().map(roles).collect();
         let mut components = vec![self.component(&velocity.u, &roles[0], None)?, self.component(&velocity.v, &roles[1], None)?];
         let levels = [0, 1].map(|k| components[k].along(2));
         if levels[0] != levels[1] {
             return Err(self.misfit(velocity.v.variable, format!("u has {} levels, v {}", levels[0], levels[1])));
         }
-        let w = self.vertical_component(velocity.w.as_ref(), roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
+        let w = self.vertical_candidate(velocity, terrain.as_ref());
+        let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
         match w {
-            Some(w) if w.along(2) == levels[0] => components.push(w),
+            Some(w) if terrain.is_some() || w.along(2) == levels[0] => components.push(w),
             Some(w) => self.note(format!("`{}` lies on other levels than u: vertical motion is taken as 0", w.name)),
             None => {}
         }
+        self.give_columns(&mut components, terrain.as_ref())?;
 
         let points = &points[..components.len()];
         let same_shapes = |l: &&Layout| l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));
@@ -312,41 +320,24 @@ impl Planner<'_> {
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: Some(resampling), notes: self.notes })
     }
 
-    /// Makes the grid and locates its nodes among the points of each component.
+    /// Makes the grid, at the mesh's own spacing unless one is set, and locates its nodes among the points of each component.
     fn resample(&mut self, points: &[Points], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
         let mut meshes: Vec<Arc<Mesh>> = Vec::new();
-        // The first component with the same coordinates.
-        let twins: Vec<usize> = (0..points.len()).map(|k| points[..k].iter().position(|p| *p == points[k]).unwrap_or(k)).collect();
-        for (k, &twin) in twins.iter().enumerate() {
-            meshes.push(if twin < k { meshes[twin].clone() } else { Arc::new(self.mesh(&points[k])?) });
+        for (k, own) in points.iter().enumerate() {
+            // Components with the same coordinates share them.
+            let twin = points[..k].iter().position(|other| other == own);
+            meshes.push(twin.map_or_else(|| self.mesh(own).map(Arc::new), |twin| Ok(meshes[twin].clone()))?);
         }
-        let target = target(&meshes[0], self.settings.resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
-        let mut locators: Vec<Arc<Locator>> = Vec::new();
-        for (k, &twin) in twins.iter().enumerate() {
-            locators.push(if twin < k { locators[twin].clone() } else { Arc::new(Locator::new(&meshes[k], &target)) });
-        }
+        let resolution = self.settings.resolution;
+        let target = target(&meshes[0], resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
         let (along, why) = self.runs_along_grid(u);
         let directions = std::array::from_fn(|k| meshes[k].directions(along).into_iter().map(|both| both[k]).collect());
-        let names = points[0].pair.map(|i| self.variable(i).name.clone());
-        let what = format!(
-            "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
-            names[0], names[1], meshes[0].shape[0], meshes[0].shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
-        );
-        self.note(what.clone());
         let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
         self.note(format!("velocities run along {which} ({why})"));
-        let kinds = [(Kind::Longitude, "degrees_east"), (Kind::Latitude, "degrees_north")];
-        let mut axes = Vec::new();
-        for (k, (kind, units)) in kinds.into_iter().enumerate() {
-            let last = target.first[k] + target.step[k] * (target.nodes[k] - 1) as f64;
-            let axis = Axis::uniform(names[k].as_str(), units, target.first[k], last, target.nodes[k]);
-            let mut axis = axis.map_err(|fault| self.fault(fault))?;
-            if k == 0 && target.round && self.wants_periodic() {
-                axis = axis.with_period(360.0);
-            }
-            axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
-        }
-        let resampled = Curvilinear { locators, meshes, target, directions, bases: target.bases(), what };
-        Ok((Resampling::Curvilinear(Arc::new(resampled)), axes))
+        let names = points[0].pair.map(|i| self.variable(i).name.clone());
+        let choice = if resolution.is_some() { Choice::Set } else { Choice::Mesh { factor: 1.0, stopped: None } };
+        let resampled = Curvilinear::new(names, meshes, Arc::new(directions), target, choice);
+        let axes = resampled.axes(self.wants_periodic()).map_err(|fault| self.fault(fault))?;
+        Ok((Resampling::Curvilinear(Arc::new(resampled)), axes.to_vec()))
     }
 }

@@ -336,6 +336,7 @@ impl Planner<'_> {
             why,
             of_water: false,
             mask: None,
+            columns: None,
         })
     }
 

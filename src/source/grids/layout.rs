@@ -4,6 +4,7 @@ use super::axes::AxisPlan;
 use super::component::ComponentPlan;
 use super::curvilinear::Curvilinear;
 use super::poles::Poles;
+use super::refine::{LARGE, ResamplingError};
 use super::staggered::Staggered;
 use super::times::TimePlan;
 use crate::archive_settings::Metric;
@@ -71,7 +72,7 @@ pub enum Resampling {
 }
 
 impl Resampling {
-    /// Reads one entry along time onto the grid. `levels` are the file's entries of the grid's levels, if the grid keeps them.
+    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`super::component::read_levels`] counts them.
     ///
     /// # Errors
     /// The values cannot be read.
@@ -83,22 +84,29 @@ impl Resampling {
     }
 
     /// Description of the resampling.
-    pub fn what(&self) -> &str {
+    pub fn what(&self) -> String {
         match self {
-            Self::Staggered(s) => &s.what,
-            Self::Curvilinear(c) => &c.what,
+            Self::Staggered(s) => s.what.clone(),
+            Self::Curvilinear(c) => c.what(),
         }
     }
 
-    /// Root mean squares over the nodes of the file, m/s: of the interpolation on the grid minus the file's values, and of the
-    /// file's values.
+    /// A warning about a large error, which says what to write.
+    pub fn warning(&self, error: &ResamplingError) -> Option<String> {
+        match self {
+            Self::Curvilinear(c) if error.excess() > LARGE => Some(c.warning(error)),
+            _ => None,
+        }
+    }
+
+    /// Error of the resampling at one entry along time.
     ///
     /// # Errors
     /// The values cannot be read.
-    pub fn error(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
+    pub fn error(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize) -> Result<ResamplingError, SourceError> {
         match self {
-            Self::Staggered(s) => s.error(file, frame, entry),
-            Self::Curvilinear(c) => c.error(file, frame, entry),
+            Self::Staggered(s) => s.error(file, frame, entry).map(ResamplingError::at_points),
+            Self::Curvilinear(c) => Ok(c.error(&c.truth(file, frame, entry, true)?)),
         }
     }
 }

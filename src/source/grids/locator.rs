@@ -24,8 +24,13 @@ pub struct Target {
 
 /// Index of no cell.
 const NOWHERE: u32 = u32::MAX;
-/// Largest number of nodes for each point of the mesh: a mesh that is dense in one place must not exhaust the memory.
+/// Largest number of nodes for each point of the mesh in a grid that has not been refined: a mesh that is dense in one place must not
+/// exhaust the memory.
 const MAX_NODES: usize = 4;
+/// Most places at which an error is measured, about, and most for each cell of the grid.
+const MAX_PLACES: [f64; 2] = [65_536.0, 16.0];
+/// Ratio of two spacings that no small whole numbers have: nodes of one grid lie anywhere in the cells of the other.
+const GOLDEN: f64 = 0.618_033_988_749_895;
 /// Extent of a mesh in degrees (0.1 m) below which it has no cells: a grid on it would have steps of 0.
 const MIN_EXTENT: f64 = 1e-6;
 /// Largest number of columns that a mesh repeats at its seam.
@@ -109,20 +114,35 @@ impl Mesh {
         (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])
     }
 
-    /// Degrees between neighbouring points along x and along y.
-    fn spacings(&self, along: usize) -> Vec<f64> {
+    /// Degrees between neighbouring points along x.
+    fn spacings(&self) -> Vec<f64> {
         let [nx, ny] = self.shape;
-        let (di, dj) = if along == 0 { (1, 0) } else { (0, 1) };
         let mut found = Vec::new();
-        for j in 0..ny - dj {
-            for i in 0..nx - di {
-                if let (Some(a), Some(b)) = (self.point(i, j), self.point(i + di, j + dj)) {
-                    let (east, north) = (turn(b[0] - a[0]) * ((a[1] + b[1]) / 2.0).to_radians().cos(), b[1] - a[1]);
-                    found.push(east.hypot(north));
-                }
+        for (j, i) in (0..ny).flat_map(|j| (0..nx - 1).map(move |i| (j, i))) {
+            if let (Some(a), Some(b)) = (self.point(i, j), self.point(i + 1, j)) {
+                found.push((turn(b[0] - a[0]) * ((a[1] + b[1]) / 2.0).to_radians().cos()).hypot(b[1] - a[1]));
             }
         }
         found
+    }
+
+    /// Steps to the east and to the north, in degrees of a great circle, in which the indices of the mesh change by one: medians over its
+    /// cells. `None` without cells.
+    fn steps(&self) -> Option<[f64; 2]> {
+        let [nx, ny] = self.shape;
+        let mut found = [Vec::new(), Vec::new()];
+        for (j, i) in (0..ny - 1).flat_map(|j| (0..nx - 1).map(move |i| (j, i))) {
+            let (Some(p), Some(q), Some(r)) = (self.point(i, j), self.point(i + 1, j), self.point(i, j + 1)) else { continue };
+            let side = |q: [f64; 2]| [turn(q[0] - p[0]) * ((p[1] + q[1]) / 2.0).to_radians().cos(), q[1] - p[1]];
+            let (a, b) = (side(q), side(r));
+            let area = (a[0] * b[1] - a[1] * b[0]).abs();
+            // The gradients of both indices are the rows of the inverse of (a, b).
+            for (k, steps) in found.iter_mut().enumerate() {
+                steps.push(area / a[1 - k].hypot(b[1 - k]));
+            }
+        }
+        let [east, north] = found.map(median);
+        east.zip(north).map(|(east, north)| [east, north])
     }
 
     /// True if the last column's neighbour is the first one.
@@ -139,7 +159,7 @@ impl Mesh {
     /// degrees to the left of it. NaN if neighbours coincide.
     pub fn directions(&self, along: bool) -> Vec<[[f32; 3]; 2]> {
         let [nx, ny] = self.shape;
-        let round = along && self.goes_round(median(self.spacings(0)).unwrap_or(0.0));
+        let round = along && self.goes_round(median(self.spacings()).unwrap_or(0.0));
         let mut out = Vec::with_capacity(nx * ny);
         for j in 0..ny {
             for i in 0..nx {
@@ -184,7 +204,7 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-/// An even grid that covers a mesh, in steps of `resolution` degrees or of the mesh's median spacing.
+/// An even grid that covers a mesh, in steps of `resolution` degrees or of the mesh's own ([`Mesh::steps`]).
 ///
 /// # Errors
 /// A mesh without cells, a resolution out of range, or too many nodes.
@@ -197,8 +217,7 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
     }
     let known: Vec<[f64; 2]> =
         (0..mesh.longitude.len()).map(|n| [mesh.longitude[n], mesh.latitude[n]]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
-    let spacing = median(mesh.spacings(0)).zip(median(mesh.spacings(1)));
-    let Some((along_x, along_y)) = spacing else { return Err("no two neighbouring points differ".into()) };
+    let Some(along_x) = median(mesh.spacings()) else { return Err("no two neighbouring points differ".into()) };
     let latitudes: Vec<f64> = known.iter().map(|p| p[1]).collect();
     let (south, north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
     let mut middle = latitudes;
@@ -207,7 +226,8 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
         return Err(format!("its points lie on one parallel, at {south} degrees north: they make no cell"));
     }
     let cosine = middle[middle.len() / 2].to_radians().cos().max(0.1);
-    let mut step = resolution.unwrap_or([along_x / cosine, along_y]);
+    let own = mesh.steps().map(|[east, north]| [east / cosine, north]);
+    let Some(mut step) = resolution.or(own) else { return Err("no four neighbouring points make a cell".into()) };
 
     // The widest arc without a point lies outside the mesh, unless it is as narrow as a cell.
     let mut circle: Vec<f64> = known.iter().map(|p| p[0].rem_euclid(360.0)).collect();
@@ -245,12 +265,43 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
 }
 
 impl Target {
+    /// Cells along both axes.
+    fn cells(&self) -> [usize; 2] {
+        [if self.round { self.nodes[0] } else { self.nodes[0] - 1 }, self.nodes[1] - 1]
+    }
+
+    /// The same box in cells that are smaller by about `factor`.
+    pub fn finer(&self, factor: f64) -> Self {
+        let old = self.cells();
+        let cells = old.map(|n| (n as f64 * factor).round().max(1.0) as usize);
+        let step = [0, 1].map(|k| self.step[k] * old[k] as f64 / cells[k] as f64);
+        Self { step, nodes: [if self.round { cells[0] } else { cells[0] + 1 }, cells[1] + 1], ..*self }
+    }
+
+    /// Another even grid in the same box, whose nodes lie anywhere in the cells of this one and of finer ones.
+    pub fn between(&self) -> Self {
+        let cells = self.cells().map(|n| n as f64);
+        let all = cells[0] * cells[1];
+        // Powers of two keep the ratio to refined grids irrational.
+        let finer = (MAX_PLACES[0].min(MAX_PLACES[1] * all) / all).sqrt().log2().floor().exp2();
+        let step = self.step.map(|step| step * GOLDEN / finer);
+        let first = [0, 1].map(|k| self.first[k] + 0.3 * step[k]);
+        let nodes = [0, 1].map(|k| (((cells[k] * self.step[k] / step[k]) - 0.3).floor() as usize).max(1) + 1);
+        Self { first, step, nodes, round: false }
+    }
+
+    /// Longitude and latitude of a node.
+    pub fn place(&self, node: usize) -> [f64; 2] {
+        let at = [node % self.nodes[0], node / self.nodes[0]];
+        [0, 1].map(|k| self.first[k] + self.step[k] * at[k] as f64)
+    }
+
     /// Unit vectors to the east and to the north at each node.
     pub fn bases(&self) -> [Vec<[f32; 3]>; 2] {
         let [nx, ny] = self.nodes;
         let at = |k: usize| -> Vec<[f32; 3]> {
             let base = |n: usize| {
-                let place = [0, 1].map(|a| self.first[a] + self.step[a] * [n % nx, n / nx][a] as f64);
+                let place = self.place(n);
                 east_north(place[0], place[1])[k].map(|v| v as f32)
             };
             (0..nx * ny).map(base).collect()
@@ -262,8 +313,7 @@ impl Target {
     pub fn interpolate(&self, values: &[f32], longitude: f64, latitude: f64) -> f64 {
         let mut x = (longitude - self.first[0]).rem_euclid(360.0) / self.step[0];
         let y = (latitude - self.first[1]) / self.step[1];
-        let [nx, ny] = self.nodes;
-        let cells = if self.round { nx } else { nx - 1 };
+        let ([nx, ny], [cells, _]) = (self.nodes, self.cells());
         if !self.round && x > cells as f64 && (360.0 / self.step[0] - x) < 1e-6 {
             x = 0.0;
         }
@@ -285,7 +335,7 @@ impl Locator {
             cell: vec![NOWHERE; target.nodes[0] * target.nodes[1]],
             place: vec![[0.0; 2]; target.nodes[0] * target.nodes[1]],
         };
-        let spacing = median(mesh.spacings(0)).unwrap_or(0.0);
+        let spacing = median(mesh.spacings()).unwrap_or(0.0);
         let across = if mesh.goes_round(spacing) { nx } else { nx - 1 };
         for j in 0..ny - 1 {
             for i in 0..across {
@@ -338,16 +388,22 @@ impl Locator {
         if row(high[1]) < 0.0 {
             return;
         }
-        let column = |l: f64| (l + longitude - target.first[0]) / target.step[0];
-        let (first, last) =
-            if pole_inside { (0, target.nodes[0] as i64 - 1) } else { (column(low[0]).ceil() as i64, column(high[0]).floor() as i64) };
-        let turn_nodes = (360.0 / target.step[0]).round() as i64;
+        // The longitudes of a grid that ends lie within a turn of its first one; those of a cell at that end may lie on either side of it.
+        let east = (longitude - target.first[0]).rem_euclid(360.0);
+        let columns = target.nodes[0] as i64;
+        let ends: &[f64] = if target.round || pole_inside { &[0.0] } else { &[0.0, 360.0] };
+        let span = |back: &f64| {
+            let column = |l: f64| (l + east - back) / target.step[0];
+            let (first, last) = (column(low[0]).ceil() as i64, column(high[0]).floor() as i64);
+            match () {
+                () if pole_inside => 0..=columns - 1,
+                () if target.round => first..=last,
+                () => first.max(0)..=last.min(columns - 1),
+            }
+        };
         for y in rows {
-            for x in first..=last {
-                let column = if target.round { x.rem_euclid(target.nodes[0] as i64) } else { x.rem_euclid(turn_nodes.max(1)) };
-                if column >= target.nodes[0] as i64 {
-                    continue;
-                }
+            for x in ends.iter().flat_map(span) {
+                let column = x.rem_euclid(columns);
                 let node = y * target.nodes[0] + column as usize;
                 if self.cell[node] != NOWHERE {
                     continue;
@@ -449,6 +505,36 @@ mod tests {
         assert!((dot(x, north).atan2(dot(x, east)).to_degrees() - 25.0).abs() < 3.0);
         assert!(dot(x, y).abs() < 1e-6 && (dot(y, north) - dot(x, east)).abs() < 1e-6, "{x:?} {y:?}");
         assert_eq!(mesh.directions(false)[middle], [east, north].map(|e| e.map(|v| v as f32)));
+    }
+
+    #[test]
+    fn the_date_line_makes_no_hole() {
+        for resolution in [0.2, 0.25, 0.31, 0.37, 0.45] {
+            let known = |east: f64| {
+                let mut mesh = turned(25.0, 41);
+                mesh.longitude.iter_mut().for_each(|l| *l = turn(*l + east));
+                let target = target(&mesh, Some([resolution; 2])).unwrap();
+                Locator::new(&mesh, &target).apply(&vec![1.0; 41 * 41]).iter().filter(|v| v.is_finite()).count()
+            };
+            // Rounding may decide for nodes on the rim.
+            assert!(known(0.0).abs_diff(known(150.0)) < 4, "{resolution}: {} and {}", known(0.0), known(150.0));
+        }
+    }
+
+    #[test]
+    fn steps_are_those_in_which_the_indices_change() {
+        // Of a mesh whose rows run north, 3 degrees apart in columns of 1 degree, on the equator; and of one whose rows lie 5 columns further east.
+        let mesh = |place: fn(f64, f64) -> [f64; 2]| {
+            let points: Vec<[f64; 2]> = (0..25).map(|n| place(f64::from(n % 5) - 2.0, f64::from(n / 5) - 2.0)).collect();
+            Mesh { shape: [5, 5], longitude: points.iter().map(|p| p[0]).collect(), latitude: points.iter().map(|p| p[1]).collect() }
+        };
+        for (place, east, north) in [
+            ((|i, j| [-0.01 * j, 0.03 * i]) as fn(f64, f64) -> [f64; 2], 0.01, 0.03),
+            (|i, j| [0.01 * i + 0.05 * j, 0.01 * j], 0.01, 0.01 / 26f64.sqrt()),
+        ] {
+            let found = mesh(place).steps().unwrap();
+            assert!((found[0] / east - 1.0).abs() < 1e-5 && (found[1] / north - 1.0).abs() < 1e-5, "{found:?}");
+        }
     }
 
     #[test]

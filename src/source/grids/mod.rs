@@ -5,9 +5,12 @@
 //! files that name their dimensions from files that do not.
 //!
 //! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan`, `staggered_plan` (WRF) and `datasets` (no named
-//! dimensions).
+//! dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation), and `refine` chooses
+//! how fine the grid of `curvilinear_plan` is.
 
 mod axes;
+mod column;
+mod column_plan;
 mod component;
 mod content;
 mod curvilinear;
@@ -24,13 +27,14 @@ mod plan;
 mod planner;
 mod poles;
 mod rectilinear;
+mod refine;
 mod staggered;
 mod staggered_plan;
 mod times;
 mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
-pub use component::{ComponentPlan, Orders, read_component};
+pub use component::{ComponentPlan, Orders, read_component, read_levels};
 pub use content::{Content, content};
 pub use land::Mask;
 pub use layout::{Layout, Resampling, difference};
@@ -38,4 +42,5 @@ pub use levels::{REFERENCE_PRESSURE, SCALE_HEIGHT, to_heights};
 pub use mask::{Masks, NO_MASK, ZERO, holds_mask};
 pub use plan::{plan, readable_axes};
 pub use poles::Poles;
+pub use refine::ResamplingError;
 pub use velocity_units::VelocityScale;

@@ -25,7 +25,7 @@ pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>)
     } else if let Some(points) = planner.curvilinear_points(&velocity)? {
         planner.plan_curvilinear(&velocity, points, first)
     } else {
-        planner.plan_rectilinear(&velocity)
+        planner.plan_rectilinear(&velocity, first)
     }
 }
 

@@ -184,6 +184,7 @@ impl<'a> Planner<'a> {
             dimensions: self.dimensions_of(candidate.variable),
             of_water: is_of_water(self.listing(), variable),
             mask: None,
+            columns: None,
         })
     }
 

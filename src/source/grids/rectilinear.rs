@@ -1,6 +1,7 @@
 //! Files whose components share one grid of coordinates in rows.
 
 use super::axes::{AxisPlan, Coordinates, Quantity};
+use super::column_plan::Terrain;
 use super::component::Role;
 use super::dimensions::Extent;
 use super::layout::Layout;
@@ -8,7 +9,7 @@ use super::planner::Planner;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
-use crate::cf::velocity::{self, Velocity};
+use crate::cf::velocity::{self, Candidate, Velocity};
 use crate::error::SourceError;
 use crate::formats::Variable;
 use ridgewatch_base::setting::word;
@@ -31,12 +32,14 @@ impl Planner<'_> {
     }
 
     /// Plans a file whose components lie on the same points.
-    pub fn plan_rectilinear(mut self, velocity: &Velocity) -> Result<Layout, SourceError> {
-        self.check_same_points(velocity)?;
+    pub fn plan_rectilinear(mut self, velocity: &Velocity, first: Option<&Layout>) -> Result<Layout, SourceError> {
         let u = velocity.u.variable;
         let mut extents = self.extents(u)?;
+        let terrain = self.terrain(velocity, &mut extents, first)?;
+        let w = self.vertical_candidate(velocity, terrain.as_ref());
+        self.check_same_points(velocity, w, terrain.as_ref())?;
         self.name_by_position(u, &mut extents)?;
-        let level = self.pick_level(&extents)?;
+        let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
 
         let mut axes = Vec::new();
@@ -48,32 +51,48 @@ impl Planner<'_> {
             _ => None,
         };
         extents.sort_by_key(|e| place(e.kind).unwrap_or(3));
-        let three = extents.iter().any(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
-        let metric = self.metric(&extents, three)?;
+        let levels = extents.iter().any(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
+        let three = terrain.as_ref().map_or(levels, Terrain::is_three);
+        let metric = self.metric(&extents, three, terrain.is_some())?;
         for extent in &extents {
             let role = match (place(extent.kind), level) {
                 (_, Some((dimension, index))) if dimension == extent.dimension => Role::Fixed(index),
                 (Some(k), _) => Role::Axis(k),
                 (None, _) => Role::Time,
             };
-            if let Role::Axis(k) = role {
-                axes.push(self.axis(u, extent, k)?);
+            match (role, &terrain) {
+                (Role::Axis(2), Some(terrain)) => axes.extend(self.height_axis(terrain)?),
+                (Role::Axis(k), _) => axes.push(self.axis(u, extent, k)?),
+                _ => {}
             }
             roles.push((extent.dimension, role));
         }
+        // w may lie between the levels of u.
+        if let (Some(terrain), Some(w)) = (&terrain, w) {
+            let own = self.variable(w.variable).dimensions.iter().filter(|&&d| terrain.is_along(2, d));
+            roles.extend(own.map(|&d| (d, Role::Axis(2))));
+        }
         let mut components =
             vec![self.component(&velocity.u, &roles, Some(&axes[0]))?, self.component(&velocity.v, &roles, Some(&axes[1]))?];
-        components.extend(self.vertical_component(velocity.w.as_ref(), &roles, axes.get(2), three)?);
+        components.extend(self.vertical_component(w, &roles, axes.get(2), three)?);
+        self.give_columns(&mut components, terrain.as_ref())?;
         let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: None, notes: self.notes })
     }
 
-    fn check_same_points(&self, found: &Velocity) -> Result<(), SourceError> {
+    fn check_same_points(&self, found: &Velocity, w: Option<&Candidate>, terrain: Option<&Terrain>) -> Result<(), SourceError> {
         let listing = self.listing();
-        let differs = |other: &usize| !velocity::same_dimensions(listing, found.u.variable, *other);
-        let Some(other) = [Some(&found.v), found.w.as_ref()].into_iter().flatten().map(|c| c.variable).find(differs) else {
-            return Ok(());
+        let but_levels = |which: usize, variable: usize| {
+            let dims = &self.variable(variable).dimensions;
+            dims.iter().copied().filter(|&d| terrain.is_none_or(|t| !t.is_along(which, d))).collect::<Vec<_>>()
         };
+        let u = found.u.variable;
+        let differs = |&(which, other): &(usize, usize)| match terrain {
+            Some(_) => but_levels(which, other) != but_levels(0, u),
+            None => !velocity::same_dimensions(listing, u, other),
+        };
+        let others = [Some((1, found.v.variable)), w.map(|w| (2, w.variable))];
+        let Some((_, other)) = others.into_iter().flatten().find(differs) else { return Ok(()) };
         let [a, b] = [found.u.variable, other].map(|i| self.variable(i));
         Err(self.fault(format!(
             "`{}` lies on ({}) but `{}` on ({}): staggered components are read only if they are WRF's (dimensions `..._stag`, with PH and \
@@ -86,13 +105,13 @@ impl Planner<'_> {
         )))
     }
 
-    /// The metric in force; `three` says whether the flow has three dimensions.
-    pub fn metric(&mut self, extents: &[Extent], three: bool) -> Result<Metric, SourceError> {
+    /// The metric in force; `three` says whether the flow has three dimensions, `in_metres` that its levels are heights whatever the file calls them.
+    pub fn metric(&mut self, extents: &[Extent], three: bool, in_metres: bool) -> Result<Metric, SourceError> {
         let has = |kind| extents.iter().any(|e| e.kind == kind);
         let sphere = has(Kind::Longitude) && has(Kind::Latitude);
         let level = extents.iter().find(|e| e.kind == Kind::Level).and_then(|e| e.coordinate);
         let unit = level.and_then(|c| Unit::parse(self.axis_units(Kind::Level, c).unwrap_or_default()));
-        let measured = unit.is_some_and(|u| u.is_length() || u.is_pressure());
+        let measured = in_metres || unit.is_some_and(|u| u.is_length() || u.is_pressure());
         let fault = |found: &str, accepted: &str| Err(SourceError::setting("metric", found, accepted));
         match (self.settings.metric, self.settings.velocity_unit) {
             (Some(Metric::Sphere), _) if !sphere => {

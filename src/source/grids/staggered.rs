@@ -8,6 +8,7 @@
 //! Positions count cells from the first centre: centres are at 0, 1, 2, ..., faces at -0.5, 0.5, ....
 
 use super::axes::{AxisPlan, Quantity};
+use super::column::{in_column, in_layer};
 use super::component::{ComponentPlan, SquaredErrors, read_component};
 use super::nest::{Nest, Shift, places};
 use crate::cf::coordinate::Kind;
@@ -117,20 +118,6 @@ fn spread(values: &[f32], [mx, my]: [usize; 2], [x, y]: &[Vec<LinearWeight>; 2])
     out
 }
 
-/// Linear interpolation in a column whose level `k` is at `height(k)`, ascending. `None` outside.
-fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: impl Fn(usize) -> f32) -> Option<f32> {
-    if !(z >= height(0) && z <= height(count - 1)) {
-        return None;
-    }
-    let (mut low, mut high) = (0, count - 1);
-    while high - low > 1 {
-        let middle = (low + high) / 2;
-        if height(middle) <= z { low = middle } else { high = middle }
-    }
-    let weight = (z - height(low)) / (height(high) - height(low));
-    Some(value(low) * (1.0 - weight) + value(high) * weight)
-}
-
 fn values(file: &DataFile, plan: &ComponentPlan, entry: usize) -> Result<Vec<f32>, SourceError> {
     read_component(file, plan, &plan.file_order(), entry)
 }
@@ -202,9 +189,7 @@ impl Staggered {
                     let found = match which {
                         2 => in_column(z, half_levels + 1, at_full, value),
                         // Between the ground and the lowest half level the wind is that of the half level; above the highest alike.
-                        _ if z >= at_full(0) && z < at_half(0) => Some(value(0)),
-                        _ if z > at_half(half_levels - 1) && z <= at_full(half_levels) => Some(value(half_levels - 1)),
-                        _ => in_column(z, half_levels, at_half, value),
+                        _ => in_layer(z, [at_full(0), at_full(half_levels)], half_levels, at_half, value),
                     };
                     on_heights[level * plane + point] = found.unwrap_or(f32::NAN);
                 }
@@ -234,7 +219,7 @@ impl Staggered {
         Some((metres(0, x), metres(1, y), degrees))
     }
 
-    /// See [`super::layout::Resampling::error`].
+    /// Root mean squares over the points of the file, m/s: of the interpolation on the grid minus the file's values, and of the file's values.
     pub fn error(&self, file: &DataFile, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
         let grid = self.on_own_cells(file, frame, entry)?;
         let full = self.full_levels(file, entry)?;
@@ -309,13 +294,5 @@ mod tests {
         assert_eq!(on_grid, [15.0, 20.0, 30.0, 40.0, 60.0]);
         let centred: Vec<f32> = cells.weights(0, &places, false).iter().map(|t| t.of(|i| u[i])).collect();
         assert_eq!(centred, [10.0, 15.0, 20.0, 30.0, 40.0]);
-    }
-
-    #[test]
-    fn columns_end_where_their_levels_do() {
-        let heights = [0.0f32, 10.0, 40.0];
-        let at = |z: f32| in_column(z, 3, |k| heights[k], |k| heights[k] * 2.0);
-        assert_eq!((at(5.0), at(25.0), at(40.0)), (Some(10.0), Some(50.0), Some(80.0)));
-        assert_eq!((at(-0.1), at(40.1), at(f32::NAN)), (None, None, None));
     }
 }

@@ -1,0 +1,349 @@
+//! Finds levels that follow the bottom of the sea: by `formula_terms` (CF conventions, appendix D), else by the names of ROMS and CROCO.
+
+use super::axes::{AxisPlan, Quantity};
+use super::column::{Columns, Formula};
+use super::component::{ComponentPlan, Role};
+use super::dimensions::Extent;
+use super::layout::Layout;
+use super::planner::Planner;
+use crate::cf::coordinate::Kind;
+use crate::cf::units::Unit;
+use crate::cf::velocity::{Candidate, Velocity};
+use crate::error::SourceError;
+use crate::formats::{Attribute, Variable};
+use ridgewatch_field::Axis;
+use std::sync::Arc;
+
+/// Levels of u, v and w that follow the bottom, and their dimensions.
+pub struct Terrain {
+    of: Vec<Option<(usize, Arc<Columns>)>>,
+    /// Heights of the grid, metres; one if a single depth is read.
+    heights: Vec<f64>,
+}
+
+/// Names of ROMS and CROCO, for levels of tracers and those between them: s, C(s).
+const NAMES: [[&[&str]; 2]; 2] = [[&["s_rho", "sc_r"], &["Cs_r", "Cs_rho"]], [&["s_w", "sc_w"], &["Cs_w"]]];
+
+impl Terrain {
+    /// True along the levels of component `which` (0, 1, 2 for u, v, w).
+    pub fn is_along(&self, which: usize, dimension: usize) -> bool {
+        self.of.get(which).and_then(Option::as_ref).is_some_and(|(own, _)| *own == dimension)
+    }
+
+    /// False if a single depth is read.
+    pub fn is_three(&self) -> bool {
+        self.heights.len() > 1
+    }
+
+    /// Levels of a component.
+    pub fn columns(&self, which: usize) -> Option<Arc<Columns>> {
+        self.of.get(which)?.as_ref().map(|(_, columns)| columns.clone())
+    }
+}
+
+impl Planner<'_> {
+    /// The levels of the components, if u has levels that follow the bottom, and the heights that they are interpolated to: `level`, `heights`, those of
+    /// the archive's first file, or the mean heights of its levels. `extents` are those of u, whose levels are marked.
+    ///
+    /// # Errors
+    /// Values that cannot be read; terms that do not fit; settings that do not fit.
+    pub fn terrain(&mut self, velocity: &Velocity, extents: &mut [Extent], first: Option<&Layout>) -> Result<Option<Terrain>, SourceError> {
+        let time = extents.iter().find(|e| e.kind == Kind::Time).map(|e| e.dimension);
+        let u = velocity.u.variable;
+        let Some((dimension, columns)) = self.columns(u, time)? else { return Ok(None) };
+        let Some(extent) = extents.iter_mut().find(|e| e.dimension == dimension) else { return Ok(None) };
+        extent.kind = Kind::Level;
+        let mut found = vec![Some((dimension, columns))];
+        let v = self.columns(velocity.v.variable, time)?;
+        if v.is_none() {
+            return Err(self.misfit(velocity.v.variable, "it has no levels that follow the bottom, which u has"));
+        }
+        found.push(v);
+        found.push(match &velocity.w {
+            Some(w) => self.columns(w.variable, time)?,
+            None => None,
+        });
+        let Some((_, columns)) = &found[0] else { return Ok(None) };
+        let heights = self.heights_for(columns, first)?;
+        let level = &self.listing().dimensions[dimension].name;
+        let to = match heights[..] {
+            [one] => format!("to height {one} m"),
+            _ => format!("to {} heights from {:.1} to {:.1} m", heights.len(), heights[0], heights[heights.len() - 1]),
+        };
+        let why = match (self.settings.level, &self.settings.heights) {
+            (None, None) => {
+                "0 and the mean heights of the levels over all columns; others with archive.heights, one with --set archive.level=-DEPTH"
+            }
+            _ => "as set",
+        };
+        let surface =
+            columns.surface.as_ref().map_or("at rest, since no term gives its height".into(), |s| format!("`{}` of each time", s.name));
+        self.note(format!(
+            "`{level}` follows the bottom (CF conventions, appendix D; depth `{}`, surface {surface}): each column is interpolated between its own \
+             levels {to} ({why}); below the bottom it is missing",
+            columns.depth.name
+        ));
+        let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
+        Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights }))
+    }
+
+    fn heights_for(&self, columns: &Columns, first: Option<&Layout>) -> Result<Vec<f64>, SourceError> {
+        let s = self.settings;
+        let known = first.and_then(|layout| layout.frames[0][0].columns.as_ref()).map(|columns| columns.heights.clone());
+        match (s.level, &s.heights, known) {
+            (Some(_), Some(_), _) => {
+                Err(SourceError::setting("heights", "given beside `level`", "one of them: `level` reads one depth, `heights` several"))
+            }
+            (_, _, Some(known)) => Ok(known),
+            (Some(level), None, None) => {
+                let deepest = columns.deepest(self.file)?;
+                if level > 0.0 || level < -deepest {
+                    let accepted =
+                        format!("heights in metres, negative below the surface: from {:.1} at the deepest bottom to 0", -deepest);
+                    return Err(SourceError::setting("level", level.to_string(), accepted));
+                }
+                Ok(vec![level])
+            }
+            (None, Some(heights), None) if heights.len() < 2 => {
+                let accepted = "two heights or more, in metres, negative below the surface; one with --set archive.level=-DEPTH";
+                Err(SourceError::setting("heights", format!("{heights:?}"), accepted))
+            }
+            (None, Some(heights), None) => Ok(heights.clone()),
+            (None, None, None) => match columns.mean_heights(self.file)? {
+                heights if heights.len() < 2 => {
+                    Err(SourceError::variable(self.path(), &columns.depth.name, "no depth is above 0: the levels have no heights"))
+                }
+                heights => Ok(heights),
+            },
+        }
+    }
+
+    /// The axis of heights; `None` if a single depth is read.
+    pub fn height_axis(&self, terrain: &Terrain) -> Result<Option<AxisPlan>, SourceError> {
+        if !terrain.is_three() {
+            return Ok(None);
+        }
+        let axis = Axis::new("altitude", "m", terrain.heights.clone()).map_err(|fault| self.fault(fault))?;
+        Ok(Some(AxisPlan::made(Kind::Level, axis, Quantity::Length)))
+    }
+
+    /// w, unless it does not lie on levels that follow the bottom although u does, or runs through them.
+    pub fn vertical_candidate<'v>(&mut self, velocity: &'v Velocity, terrain: Option<&Terrain>) -> Option<&'v Candidate> {
+        let w = velocity.w.as_ref()?;
+        let Some(terrain) = terrain else { return Some(w) };
+        let name = &self.variable(w.variable).name;
+        let odd = match () {
+            () if self.settings.w.is_none() && name.eq_ignore_ascii_case("omega") => "is the velocity through the levels",
+            () if terrain.columns(2).is_none() => "does not lie on levels that follow the bottom",
+            () => return Some(w),
+        };
+        self.note(format!("`{name}` {odd}, and is not used"));
+        None
+    }
+
+    /// Gives the levels to the components that lie on them.
+    pub fn give_columns(&self, components: &mut [ComponentPlan], terrain: Option<&Terrain>) -> Result<(), SourceError> {
+        for (which, component) in components.iter_mut().enumerate() {
+            component.columns = terrain.and_then(|terrain| terrain.columns(which));
+            if component.columns.is_some() && !component.roles.ends_with(&[Role::Axis(1), Role::Axis(0)]) {
+                let what = "its levels follow the bottom, so that its last dimensions have to be y and x";
+                return Err(SourceError::variable(self.path(), &component.name, what));
+            }
+        }
+        Ok(())
+    }
+
+    /// Levels of a variable that follow the bottom, without heights to interpolate to, and their dimension.
+    fn columns(&mut self, variable: usize, time: Option<usize>) -> Result<Option<(usize, Columns)>, SourceError> {
+        let dims = &self.variable(variable).dimensions;
+        let Some((&[y, x], others)) = dims.split_last_chunk::<2>().map(|(rest, plane)| (plane, rest)) else { return Ok(None) };
+        let listing = self.listing();
+        for &dimension in others.iter().filter(|&&d| listing.dimensions[d].len > 1 && Some(d) != time) {
+            let coordinates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
+            let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
+            let found = match declared {
+                Some(level) => self.by_terms(variable, dimension, level)?,
+                None => self.by_names(dimension)?,
+            };
+            let Some(Terms { formula, levels, critical_depth, depth, surface }) = found else { continue };
+            let mut order: Vec<usize> = (0..levels.len()).collect();
+            order.sort_by(|&a, &b| levels[a][0].total_cmp(&levels[b][0]));
+            if levels.iter().flatten().any(|v| !v.is_finite()) || !critical_depth.is_finite() {
+                return Err(self.misfit(variable, "a term of its levels is missing or not a number"));
+            }
+            let plane = [x, y].map(|d| self.listing().dimensions[d].len);
+            let depth = self.plane_field(depth, plane, time, variable)?;
+            let surface = surface.map(|index| self.plane_field(index, plane, time, variable)).transpose()?;
+            let levels = order.iter().map(|&k| levels[k]).collect();
+            return Ok(Some((dimension, Columns { formula, levels, order, critical_depth, depth, surface, heights: Vec::new() })));
+        }
+        Ok(None)
+    }
+
+    /// Terms that `formula_terms` of the coordinate `level` names.
+    fn by_terms(&mut self, variable: usize, dimension: usize, level: usize) -> Result<Option<Terms>, SourceError> {
+        let coordinate = self.variable(level);
+        let Some(declared) = formula_of(coordinate) else { return Ok(None) };
+        let text = coordinate.text("formula_terms").unwrap_or_default();
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let name_of = |term: &str| {
+            let key = format!("{term}:");
+            words.iter().position(|word| *word == key).and_then(|k| words.get(k + 1)).copied()
+        };
+        let listing = self.listing();
+        let find = |term: &str, usual: &str| listing.find(name_of(term).unwrap_or(usual));
+        let Some(depth) = find("depth", "h") else {
+            let (name, depth) = (&coordinate.name, name_of("depth").unwrap_or("h"));
+            self.note(format!(
+                "`{name}` follows the bottom, but its depth `{depth}` is not in the files: name the file that holds it too, to read fixed depths"
+            ));
+            return Ok(None);
+        };
+        let surface = find("eta", "zeta");
+        let s = self.coordinate_values(level)?;
+        if declared == Declared::Sigma {
+            let levels = s.iter().map(|&s| [s, s]).collect();
+            return Ok(Some(Terms { formula: Formula::G2, levels, critical_depth: 0.0, depth, surface }));
+        }
+        let lacking = |term: &str| {
+            let what = format!("its levels `{}` lack the term `{term}` of their formula (`formula_terms`)", coordinate.name);
+            self.misfit(variable, what)
+        };
+        let number = |term: &str, usual: &str| self.scalar(&[name_of(term).unwrap_or(usual)])?.ok_or_else(|| lacking(term));
+        let critical_depth = number("depth_c", "hc")?;
+        let (formula, stretching) = match declared {
+            Declared::S => {
+                let (a, b) = (number("a", "theta_s")?, number("b", "theta_b")?);
+                (Formula::S, s.iter().map(|&s| stretching(s, a, b)).collect())
+            }
+            Declared::G1 | Declared::G2 | Declared::Sigma => {
+                let formula = if declared == Declared::G1 { Formula::G1 } else { Formula::G2 };
+                let usual = NAMES.iter().flat_map(|names| names[1]).copied();
+                let names: Vec<&str> = name_of("C").into_iter().chain(usual).collect();
+                (formula, self.along_levels(&names, dimension)?.ok_or_else(|| lacking("C"))?)
+            }
+        };
+        let levels = s.into_iter().zip(stretching).map(|(s, c)| [s, c]).collect();
+        Ok(Some(Terms { formula, levels, critical_depth, depth, surface }))
+    }
+
+    /// Terms by the names of ROMS and CROCO.
+    fn by_names(&mut self, dimension: usize) -> Result<Option<Terms>, SourceError> {
+        let name = &self.listing().dimensions[dimension].name;
+        let Some([s, stretching]) = NAMES.iter().find(|names| names[0].contains(&name.as_str())) else { return Ok(None) };
+        let (Some(s), Some(stretching)) = (self.along_levels(s, dimension)?, self.along_levels(stretching, dimension)?) else {
+            return Ok(None);
+        };
+        let (Some(depth), Some(critical_depth)) = (self.listing().find("h"), self.scalar(&["hc"])?) else { return Ok(None) };
+        let new = matches!(self.listing().attribute("VertCoordType"), Some(Attribute::Text(text)) if text.trim() == "NEW");
+        let formula = match self.scalar(&["Vtransform"])? {
+            Some(2.0) => Formula::G2,
+            None if new => Formula::G2,
+            Some(1.0) => Formula::G1,
+            None => {
+                self.note("no `Vtransform` says how the levels lie: taken as 1, as in ROMS before it had others");
+                Formula::G1
+            }
+            Some(odd) => return Err(self.fault(format!("`Vtransform` is {odd}; accepted are 1 and 2"))),
+        };
+        let levels = s.into_iter().zip(stretching).map(|(s, c)| [s, c]).collect();
+        Ok(Some(Terms { formula, levels, critical_depth, depth, surface: self.listing().find("zeta") }))
+    }
+
+    /// The first of some numbers: a variable of one entry, or an attribute of the file.
+    fn scalar(&self, names: &[&str]) -> Result<Option<f64>, SourceError> {
+        let one = |&i: &usize| self.shape(i).iter().product::<usize>() == 1 && self.variable(i).number.is_number();
+        match names.iter().find_map(|name| self.listing().find(name).filter(one)) {
+            Some(index) => Ok(self.coordinate_values(index)?.first().copied()),
+            None => Ok(names.iter().find_map(|name| self.listing().number(name))),
+        }
+    }
+
+    /// The first of some rows of numbers along the levels: a variable, or an attribute of the file.
+    fn along_levels(&self, names: &[&str], dimension: usize) -> Result<Option<Vec<f64>>, SourceError> {
+        let along = |&i: &usize| self.variable(i).dimensions == [dimension] && self.variable(i).number.is_number();
+        if let Some(index) = names.iter().find_map(|name| self.listing().find(name).filter(along)) {
+            return self.coordinate_values(index).map(Some);
+        }
+        let count = self.listing().dimensions[dimension].len;
+        let attribute = |name: &&str| match self.listing().attribute(name) {
+            Some(Attribute::Numbers(_, values)) if values.len() == count => Some(values.clone()),
+            _ => None,
+        };
+        Ok(names.iter().find_map(attribute))
+    }
+
+    /// A length over the plane of a variable, on its points or with one more along x or y; its last two dimensions are y and x.
+    fn plane_field(&self, field: usize, plane: [usize; 2], time: Option<usize>, of: usize) -> Result<ComponentPlan, SourceError> {
+        let variable = self.variable(field);
+        let shape = self.shape(field);
+        let rank = shape.len();
+        let fits = rank >= 2 && [0, 1].iter().all(|&k| (plane[k]..=plane[k] + 1).contains(&shape[rank - 1 - k]));
+        if !fits {
+            let what = format!(
+                "its shape is {shape:?}, but `{}` has {} x {} points along x and y; accepted are as many, or one more",
+                self.variable(of).name,
+                plane[0],
+                plane[1]
+            );
+            return Err(self.misfit(field, what));
+        }
+        self.listing().check_count(variable, &shape[rank - 2..])?;
+        let role = |k: usize| match rank - 1 - k {
+            axis @ 0..=1 => Role::Axis(axis),
+            _ if Some(variable.dimensions[k]) == time => Role::Time,
+            _ => Role::Fixed(0),
+        };
+        let unit = variable.units().and_then(Unit::parse).filter(Unit::is_length);
+        Ok(ComponentPlan {
+            name: variable.name.clone(),
+            roles: (0..rank).map(role).collect(),
+            dimensions: self.dimensions_of(field),
+            shape,
+            packing: self.packing(field)?,
+            factor: unit.map_or(1.0, |unit| unit.factor),
+            why: String::new(),
+            of_water: false,
+            mask: None,
+            columns: None,
+        })
+    }
+}
+
+/// What a formula needs.
+struct Terms {
+    formula: Formula,
+    /// s and C(s), in the order of the file.
+    levels: Vec<[f64; 2]>,
+    critical_depth: f64,
+    depth: usize,
+    surface: Option<usize>,
+}
+
+/// Formulae by their standard names.
+#[derive(Clone, Copy, PartialEq)]
+enum Declared {
+    Sigma,
+    S,
+    G1,
+    G2,
+}
+
+fn formula_of(coordinate: &Variable) -> Option<Declared> {
+    match coordinate.text("standard_name")? {
+        "ocean_sigma_coordinate" => Some(Declared::Sigma),
+        "ocean_s_coordinate" => Some(Declared::S),
+        "ocean_s_coordinate_g1" => Some(Declared::G1),
+        "ocean_s_coordinate_g2" => Some(Declared::G2),
+        _ => None,
+    }
+}
+
+/// C(s) of `ocean_s_coordinate` (CF conventions, appendix D).
+fn stretching(s: f64, a: f64, b: f64) -> f64 {
+    // The limit without stretching.
+    if a == 0.0 {
+        return s;
+    }
+    (1.0 - b) * (a * s).sinh() / a.sinh() + b * ((a * (s + 0.5)).tanh() / (2.0 * (0.5 * a).tanh()) - 0.5)
+}
