@@ -10,7 +10,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum SourceError {
     /// Nothing to open.
-    #[error("no file given: name NetCDF or HDF5 files, Zarr stores, a folder of them or a pattern such as `data/*.nc`")]
+    #[error("no file given: name NetCDF, HDF5 or GRIB files, Zarr stores, a folder of them or a pattern such as `data/*.nc`")]
     NoFiles,
     /// A pattern or folder without files.
     #[error("no file matches `{pattern}`")]

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
 mod curvilinear;
+mod grib;
 mod hdf5;
 mod hemispheres;
 #[path = "../kit/mod.rs"]
@@ -55,6 +56,24 @@ fn refused(files: &[impl AsRef<Path>], toml: &str, pieces: &[&str]) -> SourceErr
         assert!(message.contains(piece), "{toml:?}: `{piece}` is missing in: {message}");
     }
     error
+}
+
+/// Asserts that two archives are the same: grid, times, and each number of each snapshot.
+#[track_caller]
+fn same(found: &mut Archive, expected: &mut Archive, what: &str) {
+    let coordinates = |archive: &Archive| archive.grid().axes.iter().map(|axis| axis.coordinates().to_vec()).collect::<Vec<_>>();
+    assert_eq!(coordinates(found), coordinates(expected), "{what}");
+    assert_eq!(found.grid().geometry, expected.grid().geometry, "{what}");
+    assert_eq!(found.seconds(), expected.seconds(), "{what}");
+    assert!(!expected.times().is_empty());
+    for index in 0..expected.times().len() {
+        let bits = |archive: &mut Archive| -> Vec<[u32; 4]> {
+            archive.read(index).unwrap().nodes.iter().map(|node| node.map(f32::to_bits)).collect()
+        };
+        let (found, expected) = (bits(found), bits(expected));
+        let other = found.iter().zip(&expected).position(|(found, expected)| found != expected);
+        assert_eq!((found.len(), other), (expected.len(), None), "{what}, snapshot {index}");
+    }
 }
 
 /// Inspects files with the default settings.

@@ -48,7 +48,6 @@ fn files_that_are_not_there_or_not_netcdf() {
     says(&dir.path().join("absent.nc"), &["cannot be opened", "No such file"]);
     says(&at("empty.nc", b""), &["it is empty"]);
     says(&at("text.nc", b"time,lat,lon\n"), &["starts with \"time,lat\"", "NetCDF-4"]);
-    says(&at("wind.grib", b"GRIB\0\0\0\x02"), &["GRIB", "cdo"]);
     says(&at("wind.nc.gz", &[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0]), &["gzip"]);
     says(&at("cdf9.nc", b"CDF\x09aaaaaaaa"), &["version 9"]);
     assert!(matches!(refused(&NO_FILES, "", &[]), SourceError::NoFiles));

@@ -4,29 +4,11 @@ use crate::kit::grids::{Ocean, Wrf, packed_levels};
 use crate::kit::netcdf::*;
 use crate::kit::program::{self, project};
 use crate::kit::zarr::{Layout, Pack, V2, V3, parts, write, zipped};
-use crate::{DAYS, inspected, open, open_with, refused};
-use ridgewatch::source::{Archive, SnapshotSource};
+use crate::{DAYS, inspected, open, open_with, refused, same};
+use ridgewatch::source::SnapshotSource;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use tempfile::tempdir;
-
-/// Asserts that two archives are the same: grid, times, and each number of each snapshot.
-#[track_caller]
-fn same(found: &mut Archive, expected: &mut Archive, what: &str) {
-    let coordinates = |archive: &Archive| archive.grid().axes.iter().map(|axis| axis.coordinates().to_vec()).collect::<Vec<_>>();
-    assert_eq!(coordinates(found), coordinates(expected), "{what}");
-    assert_eq!(found.grid().geometry, expected.grid().geometry, "{what}");
-    assert_eq!(found.seconds(), expected.seconds(), "{what}");
-    assert!(!expected.times().is_empty());
-    for index in 0..expected.times().len() {
-        let bits = |archive: &mut Archive| -> Vec<[u32; 4]> {
-            archive.read(index).unwrap().nodes.iter().map(|node| node.map(f32::to_bits)).collect()
-        };
-        let (found, expected) = (bits(found), bits(expected));
-        let other = found.iter().zip(&expected).position(|(found, expected)| found != expected);
-        assert_eq!((found.len(), other), (expected.len(), None), "{what}, snapshot {index}");
-    }
-}
 
 /// An ocean with land, four times, and packed numbers that are not round in decimals.
 fn currents() -> Fixture {

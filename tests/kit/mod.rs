@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)] // Helpers of tests may panic.
 
 pub mod flow;
+pub mod grib;
 pub mod grids;
 pub mod mutants;
 pub mod netcdf;

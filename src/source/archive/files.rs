@@ -5,7 +5,7 @@ use crate::formats::{FormatFault, is_store};
 use std::path::{Path, PathBuf};
 
 /// Extensions of the files that are taken from a folder.
-const EXTENSIONS: [&str; 7] = ["nc", "nc4", "cdf", "netcdf", "h5", "hdf5", "hdf"];
+const EXTENSIONS: [&str; 12] = ["nc", "nc4", "cdf", "netcdf", "h5", "hdf5", "hdf", "grib", "grib1", "grib2", "grb", "grb2"];
 
 /// Expands folders and patterns, in name order. A file that is named twice counts once.
 ///
@@ -74,7 +74,7 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
         }
     }
     if files.is_empty() {
-        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5, *.zarr").display().to_string() });
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5, *.grib, *.zarr").display().to_string() });
     }
     files.sort();
     Ok(files)

@@ -1,7 +1,7 @@
 //! Finding the velocity: by `standard_name`, then by usual names, then by `long_name`; always with a fitting unit.
 
 use super::units::Unit;
-use crate::formats::{Listing, Variable};
+use crate::formats::{Listing, UNREADABLE, Variable};
 
 /// The rule that chooses among several candidates.
 pub const RULE: &str = "standard names go before usual names before long names, then pairs of one naming family, then more \
@@ -104,7 +104,7 @@ pub struct Velocity {
 pub fn judge(listing: &Listing, index: usize, stated: [Option<&str>; 3]) -> Result<Candidate, String> {
     let variable = &listing.variables[index];
     if !variable.number.is_number() {
-        return Err("holds no numbers".into());
+        return Err(variable.text(UNREADABLE).unwrap_or("holds no numbers").into());
     }
     if variable.dimensions.len() < 2 {
         return Err(format!("has {} dimension(s); a velocity has two or more", variable.dimensions.len()));
@@ -138,9 +138,9 @@ pub fn judge(listing: &Listing, index: usize, stated: [Option<&str>; 3]) -> Resu
     }
 }
 
-/// True if a name of the variable is that of a component, whatever its unit.
-pub fn may_be_named(variable: &Variable) -> bool {
-    by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable)).is_some()
+/// The component that a name of the variable says, whatever its unit.
+pub fn named(variable: &Variable) -> Option<Component> {
+    by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable)).map(|(component, ..)| component)
 }
 
 type Named = (Component, usize, usize, String);

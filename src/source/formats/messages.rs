@@ -141,6 +141,8 @@ pub enum Format {
     NetCdf4,
     /// HDF5 without the structure of NetCDF.
     Hdf5,
+    /// GRIB whose first message is of this edition.
+    Grib(u8),
     /// Zarr of this version, and whether its arrays name their dimensions.
     Zarr { version: u8, named: bool },
 }
@@ -153,6 +155,8 @@ impl Format {
             Self::Classic(_) => "NetCDF 64-bit data",
             Self::NetCdf4 => "NetCDF-4",
             Self::Hdf5 => "HDF5",
+            Self::Grib(1) => "GRIB 1",
+            Self::Grib(_) => "GRIB 2",
             Self::Zarr { version: 2, .. } => "Zarr 2",
             Self::Zarr { .. } => "Zarr 3",
         }
@@ -163,6 +167,9 @@ impl Format {
         !matches!(self, Self::Hdf5 | Self::Zarr { named: false, .. })
     }
 }
+
+/// Attribute of a variable of [`NumberType::Other`]: why it cannot be read.
+pub const UNREADABLE: &str = "unreadable";
 
 /// Dimensions, variables and attributes of a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -274,7 +281,8 @@ pub enum FormatFault {
     Locked(String, String),
     /// Another format, perhaps this one.
     #[error(
-        "neither NetCDF, HDF5 nor Zarr ({0}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4, HDF5 and Zarr 2 and 3"
+        "neither NetCDF, HDF5, GRIB nor Zarr ({0}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4, HDF5, GRIB 1 and 2, \
+         and Zarr 2 and 3"
     )]
     Unknown(String),
     /// The file is shorter than its header says.

@@ -1,4 +1,4 @@
-//! File formats: NetCDF classic, NetCDF-4, HDF5 and Zarr, as variables, attributes and numbers.
+//! File formats: NetCDF classic, NetCDF-4, HDF5, GRIB and Zarr, as variables, attributes and numbers.
 //!
 //! In: one of three [`messages::Request`]s (list a file, describe a variable, read a hyperslab). Out: plain data ([`Listing`],
 //! [`messages::Description`], values as `f64`, [`FormatError`]). No library handle leaves this room, so that it can move to a child
@@ -9,6 +9,7 @@
 
 mod classic;
 mod data_file;
+mod grib;
 mod guard;
 mod hdf5;
 mod libraries;
@@ -25,6 +26,6 @@ pub use data_file::DataFile;
 pub use guard::report_crashes;
 pub use libraries::{hdf5_version, netcdf_version};
 pub use limits::Limits;
-pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, Variable};
+pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, UNREADABLE, Variable};
 pub use write::{NewVariable, Values, write_hdf5, write_netcdf};
 pub use zarr::is_store;

@@ -1,9 +1,10 @@
 //! Answers requests. The file of the last request stays open.
 
 use super::classic::ClassicStore;
+use super::grib::GribStore;
 use super::hdf5::Hdf5Store;
 use super::limits::Limits;
-use super::messages::{Description, Format, FormatError, FormatFault, Listing, NumberType, Request, Response};
+use super::messages::{Description, Format, FormatError, FormatFault, Listing, NumberType, Request, Response, UNREADABLE};
 use super::netcdf4::NetCdf4Store;
 use super::scan::{Chunks, scan};
 use super::store::Store;
@@ -84,6 +85,10 @@ impl OpenFile {
             let (listing, store) = ClassicStore::open(empty(format), file, version)?;
             return Ok(Self { listing, store: Box::new(store), chunks: Chunks::new() });
         }
+        if let Format::Grib(_) = format {
+            let (listing, store, chunks) = GribStore::open(empty(format), file, limits)?;
+            return Ok(Self { listing, store: Box::new(store), chunks });
+        }
         if let Some((listing, store, chunks)) =
             expected.and_then(|expected| Hdf5Store::open_expected(empty(Format::NetCdf4), expected, limits))
         {
@@ -108,7 +113,7 @@ impl OpenFile {
             return Err(failed(format!("{count:?} values from {start:?} were asked for, but its shape is {shape:?}")));
         }
         if variable.number == NumberType::Other {
-            return Err(failed("it holds no numbers".into()));
+            return Err(failed(variable.text(UNREADABLE).unwrap_or("it holds no numbers").into()));
         }
         let total = self.listing.check_count(variable, count)?;
         let chunk = self.chunks.get(name).copied().unwrap_or(0);
@@ -143,6 +148,9 @@ fn recognise(file: &mut File, length: u64) -> std::io::Result<Result<Format, Str
     {
         return Ok(Ok(Format::Classic(version)));
     }
+    if let [b'G', b'R', b'I', b'B', .., edition] = head {
+        return Ok(Ok(Format::Grib(edition)));
+    }
     // The signature of HDF5 may follow a user block of 512 bytes times a power of two.
     let mut at = 0u64;
     while at + 8 <= length && at <= 1 << 20 {
@@ -156,7 +164,6 @@ fn recognise(file: &mut File, length: u64) -> std::io::Result<Result<Format, Str
     }
     Ok(Err(match head {
         _ if got == 0 => "it is empty".into(),
-        [b'G', b'R', b'I', b'B', ..] => "it is GRIB: convert it, for example with `cdo -f nc copy`".into(),
         [0x1f, 0x8b, ..] => "it is compressed with gzip: unpack it first".into(),
         [b'C', b'D', b'F', version, ..] => format!("its version {version} is unknown"),
         _ => format!("it starts with {:?}", String::from_utf8_lossy(&head[..got])),

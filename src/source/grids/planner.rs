@@ -9,9 +9,9 @@ use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::packing::Packing;
 use crate::cf::units::{Unit, VELOCITY_UNITS};
-use crate::cf::velocity::{Candidate, judge, may_be_named};
+use crate::cf::velocity::{Candidate, judge, named};
 use crate::error::SourceError;
-use crate::formats::{DataFile, Listing, Variable};
+use crate::formats::{DataFile, Listing, UNREADABLE, Variable};
 use std::fmt::Display;
 use std::path::Path;
 
@@ -103,8 +103,8 @@ impl<'a> Planner<'a> {
             };
             format!("  {} ({}): {verdict}", variable.name, listing.dimension_names(variable))
         };
-        let mut shown: Vec<usize> = listing.matching(|v| v.dimensions.len() > 1).collect();
-        let rank = |i: usize| (judge(listing, i, self.settings.velocity_units()).is_err(), !may_be_named(self.variable(i)));
+        let mut shown: Vec<usize> = listing.matching(|v| v.dimensions.len() > 1 || v.text(UNREADABLE).is_some()).collect();
+        let rank = |i: usize| (judge(listing, i, self.settings.velocity_units()).is_err(), named(self.variable(i)).is_none());
         shown.sort_by_key(|&i| rank(i));
         let mut candidates: Vec<String> = shown.iter().map(|&i| line(i)).collect();
         match listing.variables.len() - shown.len() {
@@ -122,7 +122,11 @@ impl<'a> Planner<'a> {
     /// Variable that a setting names.
     pub fn named(&self, key: &str, name: &Option<String>) -> Result<Option<usize>, SourceError> {
         let Some(name) = name else { return Ok(None) };
-        self.listing().find(name).map(Some).ok_or_else(|| self.not_found(key, name))
+        let found = self.listing().find(name).ok_or_else(|| self.not_found(key, name))?;
+        match self.variable(found).text(UNREADABLE) {
+            Some(why) => Err(self.misfit(found, why)),
+            None => Ok(Some(found)),
+        }
     }
 
     /// Packing of a variable.

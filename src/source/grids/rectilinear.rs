@@ -9,9 +9,9 @@ use super::planner::Planner;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
-use crate::cf::velocity::{self, Candidate, Velocity};
+use crate::cf::velocity::{self, Candidate, Component, Velocity};
 use crate::error::SourceError;
-use crate::formats::Variable;
+use crate::formats::{UNREADABLE, Variable};
 use ridgewatch_base::setting::word;
 use ridgewatch_field::{Axis, AxisFault};
 
@@ -28,7 +28,25 @@ impl Planner<'_> {
             names.dedup();
             self.note(format!("also velocities, but passed over: {} ({})", names.join(", "), velocity::RULE));
         }
+        let lacks_w = !ignore_w && found.w.is_none();
+        self.tell_unread(lacks_w.then_some(found.u.variable))?;
         Ok(found)
+    }
+
+    /// Tells of velocities that cannot be read. Refuses them if they are the vertical motion that belongs to `u`.
+    fn tell_unread(&mut self, u: Option<usize>) -> Result<(), SourceError> {
+        for index in self.listing().matching(|v| v.text(UNREADABLE).is_some()).collect::<Vec<_>>() {
+            let variable = self.variable(index);
+            let why = variable.text(UNREADABLE).unwrap_or_default();
+            match (velocity::named(variable), u) {
+                (None, _) => {}
+                (Some(Component::W), Some(u)) if variable.dimensions.len() == self.variable(u).dimensions.len() => {
+                    return Err(self.misfit(index, format!("{why}; or leave vertical motion out with --set archive.w=none")));
+                }
+                _ => self.note(format!("`{}` cannot be read: {why}", variable.name)),
+            }
+        }
+        Ok(())
     }
 
     /// Plans a file whose components lie on the same points.
