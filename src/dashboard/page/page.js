@@ -9,7 +9,7 @@ import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, asker, download, histogramAsker, pixelAt, planeAsker } from "./values.js";
+import { Values, asker, download, fieldCommand, histogramAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -180,6 +180,7 @@ function showPosition() {
   element("earlier").disabled = index <= 0;
   element("later").disabled = index >= last;
   for (const button of document.querySelectorAll("[data-save]")) button.disabled = picture.shown === null;
+  element("field").disabled = picture.shown === null;
 }
 
 function conditionItem({ id, level, text, tick }) {
@@ -267,6 +268,19 @@ async function save(ending) {
   if (told !== null) warnings.hold("download", told, picture.shown.frame);
 }
 
+/** Shows and copies the command for the field of the slide that is looked at, or hides it again. */
+async function showField() {
+  const [told, { record }] = [element("field-told"), picture.shown.header];
+  told.hidden = !told.hidden || !record;
+  element("field").setAttribute("aria-expanded", String(!told.hidden));
+  if (told.hidden) return;
+  const { words, command } = fieldCommand(values.kept?.ready ?? "run", server?.endpoint, record);
+  setText(told.firstChild, words);
+  setText(told.lastChild, command ?? "");
+  // Where the page may not copy, a click selects all of it.
+  if (command) await navigator.clipboard?.writeText(command).catch(() => {});
+}
+
 async function share() {
   const address = new URL("./", location.href);
   address.searchParams.set("token", server?.token_to_share ?? "");
@@ -337,6 +351,7 @@ for (const type of ["pointermove", "pointerdown"]) element("frame").addEventList
 // A finger that is lifted leaves the value of its pixel.
 element("frame").addEventListener("pointerleave", (event) => event.pointerType === "touch" || values.point(null, null));
 for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", () => save(button.dataset.save));
+element("field").addEventListener("click", showField);
 element("pause").addEventListener("click", () => steering.togglePause());
 element("home").addEventListener("click", () => steering.home());
 element("share").addEventListener("click", share);

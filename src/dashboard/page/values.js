@@ -119,6 +119,18 @@ export function fileName(run, { frame, slide }, ending) {
   return `${run}-frame-${String(frame).padStart(6, "0")}-slide-${String(slide).padStart(4, "0")}.${ending}`;
 }
 
+/** The command that writes the FTLE of a frame's slide as NetCDF, and what is to be said about it; `command` is null where none can. */
+export function fieldCommand(run, endpoint, { slide, time, date, tau, direction, live, time_unit: unit }) {
+  if (live) return { words: "No command writes the field of a running simulation, whose steps are gone; ridgewatch ftle reads archives and closed forms.", command: null };
+  // What a run publishes at a path of its own is refused of a scene file, whoever wrote it, and has no meaning here.
+  const published = endpoint?.startsWith("ipc://") ? "--set publish.endpoint=private " : "";
+  const options = `--slide ${slide} --set time.tau=${tau} --set time.direction=${direction}`;
+  return {
+    words: `Traces the FTLE of slide ${count(slide)}, t0 = ${date ?? withUnit(time, unit)}, on a grid (--grid sets it) beside the run; in the folder that holds the folder ${run} of the run:`,
+    command: `ridgewatch ftle ${run}/scene.toml ${options} ${published}--out ${run}-slide-${String(slide).padStart(4, "0")}.nc`,
+  };
+}
+
 function save(blob, name) {
   const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
   link.click();

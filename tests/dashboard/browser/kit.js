@@ -9,7 +9,7 @@ import path from "node:path";
 import { WebSocket, WebSocketServer } from "ws";
 
 export const REPOSITORY = path.resolve(import.meta.dirname, "../../..");
-const PROGRAM = process.env.RIDGEWATCH ?? path.join(REPOSITORY, "target/release/ridgewatch");
+export const PROGRAM = process.env.RIDGEWATCH ?? path.join(REPOSITORY, "target/release/ridgewatch");
 const CHROMIUM = process.env.CHROMIUM ?? "/usr/bin/chromium";
 const FLAGS = [
   "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",

@@ -1,10 +1,11 @@
 // Values under the pointer and saved frames in Chromium: of a run that shows itself, and of a dashboard beside one.
 import assert from "node:assert/strict";
-import { mkdirSync, readFileSync } from "node:fs";
+import { execFileSync } from "node:child_process";
+import { existsSync, mkdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { valueWords } from "../../../src/dashboard/page/values.js";
-import { TOKEN, launch, startDashboard, startShown, stop, temporary, until } from "./kit.js";
+import { PROGRAM, TOKEN, launch, startDashboard, startShown, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 const folder = temporary();
@@ -29,7 +30,7 @@ after(async () => {
 const isComplaint = (message) => ["error", "warning"].includes(message.type()) && !/getImageData|status of 410/.test(message.text());
 
 async function open(address) {
-  const context = await browser.newContext({ viewport: { width: 1280, height: 800 } });
+  const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, permissions: ["clipboard-read", "clipboard-write"] });
   const page = await context.newPage();
   complaints = [];
   page.on("console", (message) => { if (isComplaint(message)) complaints.push(message.text()); });
@@ -124,6 +125,26 @@ test("of an earlier frame it is said that its values are gone", async () => {
   assert.equal(JSON.parse(record.bytes).frame, held);
   const [drawn, decoded] = await pixels(page, png.bytes);
   assert.deepEqual(drawn, decoded);
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
+test("the command for the field of a slide writes it, at the time of the slide", async () => {
+  const page = await open(shown.url);
+  await page.click("#field");
+  const command = await page.textContent("#field-told code");
+  const slide = Number(/^ridgewatch ftle run\/scene.toml --slide (\d+) /.exec(command)[1]);
+  assert.match(await page.textContent("#field-told span"), new RegExp(`^Traces the FTLE of slide ${slide.toLocaleString("en-GB")}, `));
+  assert.equal(await page.evaluate(() => navigator.clipboard.readText()), command);
+  assert.ok((await page.evaluate(() => document.documentElement.scrollWidth)) <= 1280);
+  // It is run beside the run, whose records have the slide.
+  const told = JSON.parse(execFileSync(PROGRAM, [...command.split(" ").slice(1), "--grid", "5x3", "--device", "cpu", "--json"], { cwd: folder, encoding: "utf8" }));
+  const lines = readFileSync(path.join(folder, "run/records.jsonl"), "utf8").split("\n").slice(0, -1);
+  const record = lines.map((line) => JSON.parse(line)).find((of) => of.slide === slide);
+  assert.deepEqual([told.time, told.tau, told.grid], [record.time, record.tau, [5, 3, 1]]);
+  assert.ok(existsSync(path.join(folder, command.split(" ").at(-1))));
+  await page.click("#field");
+  await until("it is hidden", async () => !(await page.isVisible("#field-told")));
   assert.deepEqual(complaints, []);
   await page.context().close();
 });

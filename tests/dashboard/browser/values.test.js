@@ -1,7 +1,7 @@
 // The value under the pointer: which pixel it is, what is asked, and in which words it is told.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Values, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
+import { Values, fieldCommand, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
 
 const values = {
   frame: 1200, slide: 3, x: 5, y: 7, size: [96, 48], unit: "1/s",
@@ -27,6 +27,16 @@ test("a value is told with its error, and without one that is said", () => {
 
 test("names of files tell run, frame and slide", () => {
   assert.equal(fileName("gulf", { frame: 12, slide: 3 }, "exr"), "gulf-frame-000012-slide-0003.exr");
+});
+
+test("the command of a field names the slide, and of a simulation there is none", () => {
+  const record = { slide: 3, time: 1.5, date: null, tau: 10, direction: "backward", live: null, time_unit: "s" };
+  const { words, command } = fieldCommand("gulf", "tcp://127.0.0.1:5577", record);
+  assert.equal(command, "ridgewatch ftle gulf/scene.toml --slide 3 --set time.tau=10 --set time.direction=backward --out gulf-slide-0003.nc");
+  assert.match(words, /slide 3, t0 = 1.5 s, .*the folder gulf of the run/);
+  assert.match(fieldCommand("gulf", "ipc:///tmp/frames", record).command, / --set publish.endpoint=private --out gulf/);
+  const live = fieldCommand("gulf", null, { ...record, live: { step: 5 } });
+  assert.ok(live.command === null && /running simulation/.test(live.words));
 });
 
 /** With questions that the test answers. */
