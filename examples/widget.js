@@ -25,7 +25,8 @@ function render({ model, el }) {
     try {
       await picture.decode();
     } catch {
-      line.textContent = `The picture of frame ${frame} cannot be drawn.`;
+      // A newer picture interrupts this one.
+      if (picture.src === next) line.textContent = `The picture of frame ${frame} cannot be drawn.`;
     }
     if (address !== null) URL.revokeObjectURL(address);
     address = next;

@@ -75,7 +75,10 @@ class LiveFrames(anywidget.AnyWidget):
             while not self._ended.is_set():
                 if socket.poll(50):
                     heard = time.monotonic()
-                    waiting = self._sort(socket.recv_multipart()) or waiting
+                    try:
+                        waiting = self._sort(socket.recv_multipart()) or waiting
+                    except (ValueError, KeyError) as error:
+                        self.state = f"not understood: {error!r}"
                 now = time.monotonic()
                 self._tell_silence(heard, now)
                 if waiting and (self._drawn.is_set() or now - sent > SILENT):

@@ -112,7 +112,8 @@ fn cell_at(axis: &Axis, x: f64) -> usize {
     let nodes = axis.coordinates();
     let x = axis.period().map_or(x, |period| axis.first() + (x - axis.first()).rem_euclid(period));
     // On even axes, the place by the mean spacing is off by rounding at most.
-    let guess = ((x - nodes[0]) / (nodes[nodes.len() - 1] - nodes[0]) * (nodes.len() - 1) as f64) as usize + 1;
+    let guess = ((x - nodes[0]) / (nodes[nodes.len() - 1] - nodes[0]) * (nodes.len() - 1) as f64) as usize;
+    let guess = guess.min(nodes.len() - 1) + 1;
     let is_above = |at: usize| at.checked_sub(1).is_none_or(|below| nodes[below] <= x) && nodes.get(at).is_none_or(|c| *c > x);
     let above = [guess, guess + 1, guess.saturating_sub(1)].into_iter().find(|&at| at <= nodes.len() && is_above(at));
     let above = above.unwrap_or_else(|| nodes.partition_point(|c| *c <= x));

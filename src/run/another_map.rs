@@ -1,23 +1,24 @@
 //! Another tau or direction, by a command to a run in progress.
 
 use super::cycle::{Cycle, fixed_steps};
-use super::scene::settled_colours;
+use super::scene::colours;
 use super::slides::{Slide, Slides};
 use super::steering::Change;
 use super::stop::RunEnd;
 use super::transaction::{transaction, with};
 use super::{RunError, TransferRecord};
 use crate::backend::Backend;
-use crate::flow::{FlowMap, Steps};
-use crate::render::Renderer;
+use crate::flow::{FlowMap, Steps, VelocitySource, time_resolution};
+use crate::render::{Renderer, Scene};
 use crate::surrogate::network::Times;
-use crate::surrogate::{ReplayBuffer, Trace};
+use crate::surrogate::{ReplayBuffer, Sizing, Trace};
 
-/// The flow map that a command asks for. Steps that the scene gives keep their length.
-pub(super) fn asked(former: &FlowMap, set: &Change) -> FlowMap {
+/// The flow map that a command asks for after `former`. Steps that the scene gives, for the map that the run `began` with, keep their length.
+pub(super) fn asked(began: &FlowMap, former: &FlowMap, set: &Change) -> FlowMap {
     let tau = set.tau.unwrap_or(former.tau);
-    let steps = match former.steps {
-        Steps::Fixed(steps) => Steps::Fixed(((steps as f64 * tau / former.tau).ceil() as usize).max(1)),
+    let steps = match began.steps {
+        // Rounding adds no step.
+        Steps::Fixed(steps) => Steps::Fixed(((steps as f64 * (tau / began.tau) * (1.0 - 1e-12)).ceil() as usize).max(1)),
         rule => rule,
     };
     FlowMap { tau, direction: set.direction.unwrap_or(former.direction), steps, ..former.clone() }
@@ -40,11 +41,18 @@ impl<B: Backend> Cycle<'_, B> {
             let RunEnd::Failed(RunError::Flow(error)) = end else { return Err(end) };
             self.run.progress.warnings.push(format!("tau and direction stay {former_tau} and {}: {error}", former_direction.name()));
             let back = Change { tau: Some(former_tau), direction: Some(former_direction), ..Change::default() };
-            self.run.asked = self::asked(&self.run.asked, &back);
+            self.run.asked = asked(&self.run.plan.map, &self.run.asked, &back);
+            self.run.progress.take_back_map();
             if let Some(steering) = &self.run.options.steering {
                 steering.keep(former_tau, former_direction);
             }
-            return self.trace_from(slides, slide, former);
+            self.trace_from(slides, slide, former)?;
+            // Colours and tolerance may have come with it.
+            if self.look_at_steps(slide)? {
+                with!(&mut self.session, on => on.tracer = None);
+                self.trace_anew(slide)?;
+            }
+            return self.probe_again(slide);
         }
         let chosen = with!(&self.session, on => on.tracer().flow().step_choice());
         if let Some(steps) = with!(&self.session, on => fixed_steps(on.tracer().flow())) {
@@ -77,22 +85,33 @@ impl<B: Backend> Cycle<'_, B> {
         if !self.run.has_range {
             let plan = self.run.plan;
             scene.transfer = loop {
+                let stop = self.run.stop;
                 let settled = with!(&self.session, on => {
                     let tracer = on.tracer();
-                    self.run.threads.render().install(|| settled_colours(plan, tracer, slide))
+                    self.run.threads.render().install(|| colours(plan, tracer, slide, stop))
                 });
                 match settled {
-                    Err(RunError::Device(error)) => self.session.recover(*error, slide, &self.map, &mut self.run)?,
+                    Err(RunEnd::Device(error)) => self.session.recover(error, slide, &self.map, &mut self.run)?,
                     // The picture shows what is missing, in the former colours.
-                    Err(RunError::AllMissing { .. }) => break scene.transfer,
+                    Err(RunEnd::Failed(RunError::AllMissing { .. })) => break scene.transfer,
                     settled => break settled?,
                 }
             };
         }
-        let range = (scene.transfer.low.unwrap_or_default(), scene.transfer.high.unwrap_or_default());
         let run = &mut self.run;
         let (plan, tau) = (run.plan, self.map.tau);
-        run.renderer = run.threads.render().install(|| Renderer::new(scene, &plan.domain, tau))?;
+        let drawn = |scene: Scene| run.threads.render().install(|| Renderer::new(scene, &plan.domain, tau));
+        let former = run.renderer.scene().clone();
+        // The end that the scene gives may be beyond the one that is scaled to this FTLE.
+        run.renderer = match drawn(scene) {
+            Err(error) => {
+                run.progress.warnings.push(format!("the colours stay, since those of this tau and direction are not accepted: {error}"));
+                drawn(former)?
+            }
+            renderer => renderer?,
+        };
+        let transfer = &run.renderer.scene().transfer;
+        let range = (transfer.low.unwrap_or_default(), transfer.high.unwrap_or_default());
         run.transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(run.renderer.transfer().extinction_max()) };
         run.report.transfer = Some(run.transfer);
         run.draw_color_bar();
@@ -110,6 +129,15 @@ impl<B: Backend> Cycle<'_, B> {
         learning.start = slide.time;
         learning.resize = None;
         learning.peak = f32::NEG_INFINITY;
+        if learning.sizing.is_some() {
+            // Sizes that the former map rejected may suit this one.
+            learning.sizing = Some(Sizing::new(&learning.settings, &scene.network, &plan.domain)?);
+        }
+        self.run.report.time_resolution = match &slide.velocity {
+            VelocitySource::Window(window) => Some(self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?),
+            VelocitySource::Analytic(..) => None,
+        };
+        self.run.progress.seconds_per_sample = None;
         self.run.progress.steps_shown = 0;
         self.run.progress.has_warned_of_deaths = false;
         if with!(&self.session, on => on.surrogate.is_some()) {
@@ -117,5 +145,20 @@ impl<B: Backend> Cycle<'_, B> {
         }
         transaction!(self, slide, run, on => run.pilot(on));
         self.probe_again(slide)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_keep_their_length_whatever_was_asked_for_before() {
+        let began = FlowMap::tangent(5.0, 20);
+        let mut map = began.clone();
+        for (tau, steps) in [(4.9, 20), (5.0, 20), (0.001, 1), (5.0, 20), (2.5, 10), (7.5, 30), (5.0, 20)] {
+            map = asked(&began, &map, &Change { tau: Some(tau), ..Change::default() });
+            assert_eq!((map.tau, map.steps), (tau, Steps::Fixed(steps)));
+        }
     }
 }

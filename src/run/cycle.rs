@@ -202,6 +202,14 @@ pub(super) struct RunProgress {
 }
 
 impl RunProgress {
+    /// Forgets that commands asked for another tau or direction, since it could not be had.
+    pub(super) fn take_back_map(&mut self) {
+        for command in &mut self.commands {
+            (command.set.tau, command.set.direction) = (None, None);
+        }
+        self.commands.retain(|command| !command.set.is_empty());
+    }
+
     /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows.
     pub(super) fn affordable_samples(&self, settings: &RenderSettings) -> f64 {
         /// Samples a pixel of the first frame with a budget, whose cost is not known.
@@ -479,7 +487,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// Chooses the steps anew if they do not suit the picture of this slide. Returns whether the flow map is another one.
-    fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
+    pub(super) fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
         let Some((chosen, settled)) = self.settled else { return Ok(false) };
         let (shown, begin) = (self.run.shown(), Instant::now());
         let anew = self.run.threads.render().install(|| {
@@ -596,7 +604,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// Makes the flow map of a slide, and all that was traced by the one before.
-    fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+    pub(super) fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
         let rebuilds = self.run.learning.resize.is_some();
@@ -771,7 +779,8 @@ impl Run<'_> {
         for command in steering.take() {
             let set = &command.set;
             changed = changed.max(match set {
-                _ if set.tau.is_some() || set.direction.is_some() => Commands::Map,
+                _ if set.tau.is_some_and(|tau| tau != self.asked.tau) => Commands::Map,
+                _ if set.direction.is_some_and(|direction| direction != self.asked.direction) => Commands::Map,
                 _ if set.range.is_some() || set.tolerance.is_some() => Commands::Colours,
                 _ if set.method.is_some_and(|method| method != self.render.method) => Commands::Method,
                 _ => Commands::View,
@@ -811,7 +820,7 @@ impl Run<'_> {
         }
         self.has_range |= set.range.is_some();
         // The flow map follows once all commands are applied.
-        self.asked = asked(&self.asked, set);
+        self.asked = asked(&self.plan.map, &self.asked, set);
         if let Some(method) = set.method {
             // Of another method.
             self.progress.seconds_per_sample = None;

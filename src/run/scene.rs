@@ -30,7 +30,7 @@ pub fn settled_colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide) -> Result
     }
 }
 
-fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<TransferSettings, RunEnd> {
+pub(super) fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<TransferSettings, RunEnd> {
     let file = &plan.scene;
     let transfer = file.transfer.clone().unwrap_or_default();
     if transfer.low.is_none() || transfer.high.is_none() {

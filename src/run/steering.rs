@@ -3,7 +3,7 @@
 use super::setup::{Plan, assemble};
 use super::slides::closed_form;
 use crate::field::Domain;
-use crate::flow::Direction;
+use crate::flow::{Direction, Steps};
 use crate::render::{Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, require, shown};
 use crate::trust::TrustSettings;
@@ -52,7 +52,7 @@ pub struct Range {
 }
 
 impl Change {
-    fn is_empty(&self) -> bool {
+    pub(super) fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 
@@ -69,6 +69,8 @@ impl Change {
     }
 }
 
+/// Most steps of a given length that a command may ask for.
+const MAX_STEPS: f64 = 1e6;
 const METHODS: &str = "reference, surrogate, gated, marched or two_level";
 
 /// A command that took effect.
@@ -113,6 +115,8 @@ pub struct Steering {
     render: RenderSettings,
     dimensions: usize,
     longest_tau: Option<f64>,
+    /// Of the steps that the scene gives, those in a unit of time; 0 if it gives none.
+    steps_per_time: f64,
     /// The network has times as inputs, whose range follows from tau and direction.
     learns_times: bool,
     state: Mutex<State>,
@@ -153,6 +157,10 @@ impl Steering {
             transfer: scene.transfer.clone().unwrap_or_default(),
             dimensions,
             longest_tau: closed_form(&scene.source).is_none().then_some(plan.map.tau),
+            steps_per_time: match plan.map.steps {
+                Steps::Fixed(steps) => steps as f64 / plan.map.tau,
+                _ => 0.0,
+            },
             learns_times: scene.render.method != Method::Reference && !scene.network.inputs.is_empty(),
             state: Mutex::new(State::new(&scene.render, plan.map.tau, plan.map.direction)),
             render: scene.render.clone(),
@@ -251,6 +259,11 @@ impl Steering {
         };
         let tau: f64 = read(key, value, &accepted)?;
         require(tau > 0.0 && tau <= self.longest_tau.unwrap_or(f64::MAX), key, tau, &accepted)?;
+        let steps = (self.steps_per_time * tau).round();
+        if steps > MAX_STEPS {
+            let found = format!("is {tau}, which takes {steps:e} steps of the length that flow.steps gives");
+            return Err(Refused::new(key, found, format_args!("a tau of at most {MAX_STEPS:e} steps")));
+        }
         self.check_times(key, value)?;
         Ok(tau)
     }
@@ -267,7 +280,13 @@ impl Steering {
     /// Goes on with an earlier tau and direction, since those of a command could not be taken.
     pub(super) fn keep(&self, tau: f64, direction: Direction) {
         let mut state = self.lock();
-        (state.tau, state.direction) = (tau, direction);
+        // What waits is in effect next.
+        if state.pending.iter().all(|command| command.set.tau.is_none()) {
+            state.tau = tau;
+        }
+        if state.pending.iter().all(|command| command.set.direction.is_none()) {
+            state.direction = direction;
+        }
     }
 
     /// Refuses a method that this run cannot take.
@@ -341,6 +360,7 @@ mod tests {
             render: render.clone(),
             dimensions: 2,
             longest_tau: Some(10.0),
+            steps_per_time: 2.0,
             learns_times: false,
             state: Mutex::new(State::new(render, 10.0, Direction::Forward)),
             changed: Condvar::new(),
@@ -400,6 +420,14 @@ mod tests {
         let direction = Direction::Backward;
         let set = json!({"time.direction": "backward", "time.tau": 2.5});
         assert_eq!(command(&steering, set), Ok(SteeringState { commands: 1, tau: 2.5, direction, ..state }));
+    }
+
+    #[test]
+    fn a_closed_form_takes_a_tau_of_so_many_steps() {
+        let steering = Steering { longest_tau: None, ..steering() };
+        assert_eq!(command(&steering, json!({"time.tau": 5e5})).unwrap().tau, 5e5);
+        let error = command(&steering, json!({"time.tau": 1e300})).unwrap_err();
+        assert!(error.contains("takes 2e300 steps of the length that flow.steps gives; accepted: a tau of at most 1e6 steps"), "{error}");
     }
 
     #[test]

@@ -76,6 +76,8 @@ export class Histogram {
   get range() { return this.wanted ?? this.transfer; }
 
   move(end, value) {
+    // The newest record may have no colours.
+    if (this.range === null || this.axis === null) return;
     const range = moved(this.range, end, value, this.axis);
     if (range[end] === this.range[end]) return;
     [this.wanted, this.at] = [range, performance.now()];
@@ -102,8 +104,8 @@ export class Histogram {
     } catch (error) {
       this.problem = error.message;
     }
-    this.draw();
     setTimeout(() => { this.busy = false; }, SPACING);
+    this.draw();
   }
 
   /** What is said below. */
@@ -153,7 +155,8 @@ export class Histogram {
     const most = Math.max(...counts, 1);
     context.lineWidth = devicePixelRatio;
     context.strokeStyle = style.getPropertyValue("--border");
-    counts.forEach((pixels, k) => {
+    // A frame that shows nothing has no range.
+    if (counted !== null) counts.forEach((pixels, k) => {
       const [from, to] = [k, k + 1].map((edge) => counted[0] + (edge / counts.length) * (counted[1] - counted[0]));
       const bar = [share(from) * width, height, (share(to) - share(from)) * width, (-pixels / most) * 0.92 * height];
       context.fillStyle = colour((from + to) / 2);

@@ -59,8 +59,7 @@ export class Overlay {
   }
 
   changed() {
-    if (!this.tell()) return;
-    this.due = true;
+    this.due = this.tell();
     this.next();
   }
 
@@ -85,7 +84,7 @@ export class Overlay {
   }
 
   async next() {
-    if (this.busy || !this.due) return;
+    if (this.busy || !this.due || !this.tell()) return;
     [this.busy, this.due] = [true, false];
     const { of, frame } = this;
     let plane;
