@@ -299,6 +299,15 @@ fn sizes_are_checked_before_memory_is_taken() {
     }
     std::fs::write(&grib, bytes).unwrap();
     refused(&[&grib], "memory_gib = 1", &["large.grib", "GiB of memory; accepted are 1.00 GiB"]);
+    // A field of five bytes, again and again in one message.
+    let mut bytes = winds(2, 2)[0].bytes();
+    let field = [0, 0, 0, 5, 7].repeat(1 << 20);
+    bytes.splice(bytes.len() - 4..bytes.len() - 4, field);
+    let length = bytes.len() as u64;
+    bytes[8..16].copy_from_slice(&length.to_be_bytes());
+    std::fs::write(&grib, bytes).unwrap();
+    refused(&[&grib], "", &["large.grib", "it holds more than 1048576 fields"]);
+    refused(&[&grib], "memory_gib = 0.01", &["large.grib", "the headers of", "fields"]);
 }
 
 #[test]

@@ -144,7 +144,8 @@ pub fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: imp
 /// The same, but constant between the lowest level and the lower end of the column, and between the highest level and its upper end.
 pub fn in_layer(z: f32, [bottom, top]: [f32; 2], count: usize, height: impl Fn(usize) -> f32, value: impl Fn(usize) -> f32) -> Option<f32> {
     match () {
-        () if z >= bottom && z < height(0) => Some(value(0)),
+        () if z < bottom => None,
+        () if z < height(0) => Some(value(0)),
         () if z > height(count - 1) && z <= top => Some(value(count - 1)),
         () => in_column(z, count, height, value),
     }

@@ -97,7 +97,7 @@ impl Planner<'_> {
             (_, _, Some(known)) => Ok(known),
             (Some(level), None, None) => {
                 let deepest = columns.deepest(self.file)?;
-                if level > 0.0 || level < -deepest {
+                if !(-deepest..=0.0).contains(&level) {
                     let accepted =
                         format!("heights in metres, negative below the surface: from {:.1} at the deepest bottom to 0", -deepest);
                     return Err(SourceError::setting("level", level.to_string(), accepted));
@@ -205,6 +205,13 @@ impl Planner<'_> {
             let levels = s.iter().map(|&s| [s, s]).collect();
             return Ok(Some(Terms { formula: Formula::G2, levels, critical_depth: 0.0, depth, surface }));
         }
+        // ROMS of before the names g1 and g2 says more by its variables.
+        if declared == Declared::S
+            && self.scalar(&["Vtransform"])?.is_some()
+            && let Some(terms) = self.by_names(dimension)?
+        {
+            return Ok(Some(terms));
+        }
         let lacking = |term: &str| {
             let what = format!("its levels `{}` lack the term `{term}` of their formula (`formula_terms`)", coordinate.name);
             self.misfit(variable, what)
@@ -287,6 +294,12 @@ impl Planner<'_> {
                 plane[1]
             );
             return Err(self.misfit(field, what));
+        }
+        if let Some(k) = (0..rank - 2).find(|&k| shape[k] > 1 && Some(variable.dimensions[k]) != time) {
+            let (name, of) = (&self.listing().dimensions[variable.dimensions[k]].name, &self.variable(of).name);
+            return Err(
+                self.misfit(field, format!("its dimension `{name}` is not that of the times of `{of}`: which entry counts is not known"))
+            );
         }
         self.listing().check_count(variable, &shape[rank - 2..])?;
         let role = |k: usize| match rank - 1 - k {

@@ -40,7 +40,10 @@ impl Planner<'_> {
             let why = variable.text(UNREADABLE).unwrap_or_default();
             match (velocity::named(variable), u) {
                 (None, _) => {}
-                (Some(Component::W), Some(u)) if variable.dimensions.len() == self.variable(u).dimensions.len() => {
+                // One whose grid cannot be read lacks the dimensions of the plane.
+                (Some(Component::W), Some(u))
+                    if [0, 2].iter().any(|fewer| variable.dimensions.len() + fewer == self.variable(u).dimensions.len()) =>
+                {
                     return Err(self.misfit(index, format!("{why}; or leave vertical motion out with --set archive.w=none")));
                 }
                 _ => self.note(format!("`{}` cannot be read: {why}", variable.name)),

@@ -1,5 +1,6 @@
 //! Messages of edition 1. Octets are counted from 0 here, from 1 in the manual.
 
+use super::super::limits::Limits;
 use super::super::messages::FormatFault;
 use super::date;
 use super::grid::Grid;
@@ -14,7 +15,7 @@ const SECTION_BYTES: usize = 256;
 const END: u64 = 4;
 
 /// Reads the headers of the message at `begin`. Returns its end.
-pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>) -> Result<u64, FormatFault> {
+pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>, limits: &Limits) -> Result<u64, FormatFault> {
     let damaged = |what: &str| damaged(begin, what);
     let stated = u64::from(unsigned(&input.bytes::<8>(begin)?[4..7]));
     let mut at = begin + 8;
@@ -71,7 +72,7 @@ pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>) -> Result
     let kind = Kind { parameter: Parameter::of_edition1(product[4], product[3], product[8]), levels, process, grid };
     let place =
         Place { begin, description: (at, 11), bitmap, data: (at + 11, data_end - at - 11), decimal: Some(signed(&product[26..28]) as i16) };
-    all.push(Message { kind, time, member: member(&product), level, place, fault });
+    Message { kind, time, member: member(&product), level, place, fault }.add(all, limits)?;
     Ok(end)
 }
 

@@ -1,5 +1,6 @@
 //! Messages of edition 2, which may hold several fields: sections 3 to 7 may repeat. Octets are counted from 0 here, from 1 in the manual.
 
+use super::super::limits::Limits;
 use super::super::messages::FormatFault;
 use super::date;
 use super::grid::Grid;
@@ -30,7 +31,7 @@ struct State {
 }
 
 /// Reads the headers of the message at `begin`. Returns its end.
-pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>) -> Result<u64, FormatFault> {
+pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>, limits: &Limits) -> Result<u64, FormatFault> {
     let head = input.bytes::<16>(begin)?;
     let discipline = head[6];
     let [.., a, b, c, d, e, f, g, h] = head;
@@ -82,7 +83,7 @@ pub fn read(input: &mut Input<'_>, begin: u64, all: &mut Vec<Message>) -> Result
                     }
                 });
             }
-            7 => all.push(state.field(begin, discipline, (at + 5, u64::from(length) - 5))?),
+            7 => state.field(begin, discipline, (at + 5, u64::from(length) - 5))?.add(all, limits)?,
             _ => return Err(damaged(begin, format!("its section {number} is unknown"))),
         }
         at = next;
@@ -108,7 +109,8 @@ impl State {
             Ok(product) => product,
             Err(what) => {
                 fault = Some(what);
-                Product::default()
+                // At the same place in every template, so that the parameter is told by its name.
+                Product { category: product[9], number: product[10], ..Product::default() }
             }
         };
         let time = reference.clone().and_then(|reference| match product.end {

@@ -84,6 +84,9 @@ impl Grid {
         if nx == 0 || ny == 0 || nx > MAX_NODES || ny > MAX_NODES {
             return Self::Other(format!("its grid has {nx} x {ny} nodes; accepted are 1 to {MAX_NODES} along each axis"));
         }
+        if first.iter().chain(&last).any(|angle| angle.unsigned_abs() > 2 * CIRCLE as u64) {
+            return Self::Other("its corners are no longitudes and latitudes".into());
+        }
         if scanning & 0x0f != 0 {
             return Self::Other(format!("its rows are offset against each other (scanning mode {scanning}): {REGRID}"));
         }

@@ -10,7 +10,7 @@ use super::{edition1, edition2};
 /// Most fields of a file.
 const MAX_FIELDS: usize = 1 << 20;
 /// Memory that a field takes until its variable is known.
-const FIELD_BYTES: u64 = 512;
+const FIELD_BYTES: u64 = 1024;
 
 /// Offset in the file and length.
 pub type Span = (u64, u64);
@@ -79,21 +79,32 @@ impl Message {
         while let Some(begin) = input.message(at)? {
             let head = input.bytes::<8>(begin)?;
             at = match head[7] {
-                1 => edition1::read(input, begin, &mut all)?,
-                2 => edition2::read(input, begin, &mut all)?,
+                1 => edition1::read(input, begin, &mut all, limits)?,
+                2 => edition2::read(input, begin, &mut all, limits)?,
                 edition => {
                     return Err(FormatFault::Damaged(format!(
                         "the message at byte {begin} is of edition {edition} of GRIB; accepted are 1 and 2"
                     )));
                 }
             };
-            if all.len() > MAX_FIELDS {
-                return Err(FormatFault::Refused(format!("it holds more than {MAX_FIELDS} messages; accepted are files of fewer")));
-            }
-            let bytes = (all.len() as u64).saturating_mul(FIELD_BYTES);
-            limits.check(bytes, &format!("the headers of {} messages", all.len())).map_err(FormatFault::Refused)?;
         }
         Ok(all)
+    }
+
+    /// Adds a field, unless there are too many. A message of edition 2 may hold fields of five bytes each.
+    ///
+    /// # Errors
+    /// More fields than are accepted, or than memory is granted for.
+    pub fn add(self, all: &mut Vec<Self>, limits: &Limits) -> Result<(), FormatFault> {
+        if all.len() >= MAX_FIELDS {
+            return Err(FormatFault::Refused(format!("it holds more than {MAX_FIELDS} fields; accepted are files of fewer")));
+        }
+        let bytes = (all.len() as u64 + 1) * FIELD_BYTES;
+        if bytes > limits.memory {
+            limits.check(bytes, &format!("the headers of {} fields", all.len() + 1)).map_err(FormatFault::Refused)?;
+        }
+        all.push(self);
+        Ok(())
     }
 }
 
