@@ -223,7 +223,8 @@ fn what_is_missing_or_unknown_is_told_by_name() {
         };
         if edition == 1 {
             change(8 + 28 + 5, 50, &["spherical harmonics", "cdo -f nc sp2gpl"]);
-            change(8 + 28 + 5, 3, &["its grid is a Lambert projection", "cdo -f nc remapbil"]);
+            change(8 + 28 + 5, 3, &["its grid is a Lambert projection", "wgrib2 IN -new_grid_winds earth"]);
+            change(8 + 28 + 5, 10, &["its grid is rotated or stretched", "-rotuvb,u,v"]);
             change(8 + 28 + 27, 0x01, &["its rows are offset"]);
             change(8 + 28 + 32 + 3, 0x40, &["second-order packing", "grib_set -r -s packingType=grid_simple"]);
             change(8 + 17, 4, &["months or years, which have no fixed length"]);
@@ -231,7 +232,7 @@ fn what_is_missing_or_unknown_is_told_by_name() {
             change(8 + 13, 13, &["is no date"]);
         } else {
             change(16 + 21 + 13, 50, &["spherical harmonics", "cdo -f nc sp2gpl"]);
-            change(16 + 21 + 13, 20, &["its grid is a polar stereographic projection", "cdo -f nc remapbil"]);
+            change(16 + 21 + 13, 20, &["its grid is a polar stereographic projection", "wgrib2 IN -new_grid_winds earth"]);
             change(16 + 21 + 10, 4, &["a reduced grid", "cdo -f nc setgridtype,regular"]);
             change(16 + 21 + 9, 41, &["its grid of 8 x 5 nodes is said to have 41"]);
             change(16 + 21 + 72 + 34 + 10, 51, &["it is packed as spherical harmonics"]);

@@ -185,18 +185,29 @@ const REDUCED: &str = "its rows have fewer nodes towards the poles (a reduced gr
 const SPECTRAL: &str = "it holds spherical harmonics: write it on a grid, for example with `cdo -f nc sp2gpl IN OUT`, or ask the archive \
                         for a regular `grid`";
 
+/// Winds along the axes of a grid have to be turned, which interpolation alone does not do.
+const ROTATED: &str = "its grid is rotated or stretched, with winds along its own axes: turn them and write them on regular longitudes and \
+                       latitudes, for example with `cdo -f nc remapbil,r720x361 -rotuvb,u,v IN OUT`";
+
 fn unread(name: &str) -> String {
     format!("its grid is {name}: {REGRID}")
+}
+
+fn projected(name: &str) -> String {
+    format!(
+        "its grid is a {name} projection: write it on regular longitudes and latitudes, with winds to the east and north, for example with \
+         `wgrib2 IN -new_grid_winds earth -new_grid latlon 0:720:0.5 -90:361:0.5 OUT` (edition 1: after `grib_set -s edition=2`)"
+    )
 }
 
 /// Why a grid cannot be read (code table 6 of edition 1).
 fn other_edition1(kind: u8) -> Option<String> {
     Some(match kind {
         0 | 4 => return None,
-        1 => unread("a Mercator projection"),
-        3 | 13 => unread("a Lambert projection"),
-        5 => unread("a polar stereographic projection"),
-        10 | 14 | 20 | 24 | 30 | 34 => unread("rotated or stretched, with winds along its own axes"),
+        1 => projected("Mercator"),
+        3 | 13 => projected("Lambert"),
+        5 => projected("polar stereographic"),
+        10 | 14 | 20 | 24 | 30 | 34 => ROTATED.into(),
         50 | 60 | 70 | 80 => SPECTRAL.into(),
         90 => unread("the view from a satellite"),
         _ => unread(&format!("of the unknown type {kind}")),
@@ -207,10 +218,10 @@ fn other_edition1(kind: u8) -> Option<String> {
 fn other_edition2(template: u32) -> Option<String> {
     Some(match template {
         0 | 40 => return None,
-        1..=3 | 41..=43 => unread("rotated or stretched, with winds along its own axes"),
-        10 | 12 | 13 => unread("a Mercator projection"),
-        20 | 23 => unread("a polar stereographic projection"),
-        30 | 31 | 33 | 140 => unread("a Lambert projection"),
+        1..=3 | 41..=43 => ROTATED.into(),
+        10 | 12 | 13 => projected("Mercator"),
+        20 | 23 => projected("polar stereographic"),
+        30 | 31 | 33 | 140 => projected("Lambert"),
         50..=53 | 61..=63 => SPECTRAL.into(),
         90 => unread("the view from a satellite"),
         100 | 101 => unread("made of triangles"),
