@@ -112,6 +112,18 @@ fn velocities_are_those_of_netcdf() {
     same(&mut open(&files), &mut open(&[&file]), "a file for each time");
     let both: Vec<Message> = winds(1, 3).into_iter().filter(|m| m.hour < 2).chain(at(2, 2)).collect();
     same(&mut open(&[write(&both, &grib)]), &mut open(&[&file]), "both editions");
+    // Several fields in one message, which share its date and grid.
+    let joined = [0, 1, 2].map(|hour| {
+        let all: Vec<Vec<u8>> = at(2, hour).iter().map(Message::bytes).collect();
+        let shared = 16 + 21 + 72;
+        let fields = all.iter().flat_map(|bytes| &bytes[shared..bytes.len() - 4]);
+        let mut bytes: Vec<u8> = all[0][..shared].iter().chain(fields).chain(b"7777").copied().collect();
+        let length = bytes.len() as u64;
+        bytes[8..16].copy_from_slice(&length.to_be_bytes());
+        bytes
+    });
+    std::fs::write(&grib, joined.concat()).unwrap();
+    same(&mut open(&[&grib]), &mut open(&[&file]), "several fields in a message");
     let program = program::run(program::ridgewatch(["inspect"]).arg(&grib)).success();
     assert!(program.stdout.contains("GRIB") && program.stdout.contains("isobaricInhPa"), "{}", program.stdout);
 }
