@@ -262,7 +262,7 @@ impl Steering {
         let steps = (self.steps_per_time * tau).round();
         if steps > MAX_STEPS {
             let found = format!("is {tau}, which takes {steps:e} steps of the length that flow.steps gives");
-            return Err(Refused::new(key, found, format_args!("a tau of at most {MAX_STEPS:e} steps")));
+            return Err(Refused::new(key, found, format!("a tau of at most {MAX_STEPS:e} steps")));
         }
         self.check_times(key, value)?;
         Ok(tau)
