@@ -77,10 +77,21 @@ impl Settings {
         }
         if let Some(transfer) = &self.transfer {
             // Values that are not set, and the unit of extinction, are chosen later and are always accepted.
-            Transfer::new(&transfer.scaled_to(&[0.0, 1.0]), 1.0)?;
+            Transfer::new(&with_ends(transfer), 1.0)?;
         }
         Ok(())
     }
+}
+
+/// The settings with ends that suit those that are given, for checks before the FTLE is known, to which open ends are scaled later.
+pub(super) fn with_ends(transfer: &TransferSettings) -> TransferSettings {
+    let (low, high) = (transfer.low, transfer.high);
+    TransferSettings {
+        low: low.or(high.map(|high| high - high.abs().max(1.0))),
+        high: high.or(low.map(|low| low + low.abs().max(1.0))),
+        ..transfer.clone()
+    }
+    .scaled_to(&[0.0, 1.0])
 }
 
 /// A number in the source's time unit, or words such as `"30 days"` if that unit is the second.

@@ -1,6 +1,7 @@
 //! Setup of a run from its settings: opens the source, chooses open settings, and checks everything before work starts.
 
 use super::default_tau::default_tau;
+use super::settings::with_ends;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
 use super::{RunError, Settings, TimeSettings, TimeSpan, memory};
 use crate::field::Domain;
@@ -264,8 +265,7 @@ fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> 
 /// Rejects invalid cameras, lights and transfer functions before any data is read.
 fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), Refused> {
     let mut picture = assemble(scene, domain);
-    // Open values are scaled later, to accepted values.
-    picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);
+    picture.transfer = with_ends(&picture.transfer);
     Renderer::new(picture, domain, tau)?;
     Ok(())
 }

@@ -162,7 +162,8 @@ fn a_signal_leaves_no_picture() {
     let mut running = start(command.current_dir(folder.path()));
     std::thread::sleep(std::time::Duration::from_millis(1500));
     assert!(!running.has_ended(), "{}", running.stderr());
-    running.signal(libc::SIGINT);
+    // `nohup` and background shells ignore SIGINT.
+    running.signal(libc::SIGTERM);
     until("the end", || running.has_ended());
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing half written");
 }
