@@ -43,13 +43,10 @@ fn mutated_files_are_answered() {
         ("packed levels", packed_levels(OFFSET_64, &[850.0, 500.0, 700.0], 0.0)),
         ("staggered", Wrf { format: OFFSET_64, ..Wrf::default() }.fixture()),
         ("curvilinear", Ocean { format: DATA_64, n: NODES, ..Ocean::default() }.fixture()),
-        ("curvilinear, refined", Ocean { format: DATA_64, n: NODES, ..Ocean::default() }.fixture()),
     ];
+    let settings = ArchiveSettings::default();
     let share = count.div_ceil(cases.len() as u64);
     for (name, fixture) in cases {
-        // A resolution that is set is kept.
-        let resolution = (name == "curvilinear").then_some([0.5, 0.5]);
-        let settings = ArchiveSettings { resolution, ..ArchiveSettings::default() };
         let whole = std::fs::read(fixture.write(&file)).unwrap();
         assert!(Archive::open(std::slice::from_ref(&file), &settings).is_ok());
         let used = used(&whole);
@@ -87,15 +84,12 @@ fn mutated_files_are_answered() {
         assert!(read > 0 && refused > 0, "mutations must reach both ends");
         let grown = peak() - before;
         println!("{longest:.1?} at most, {} MB more at most than before", grown >> 20);
-        if name == "curvilinear, refined" {
-            // Of two grids, each of at most 256 nodes for each point of the mesh (docs/archives.md).
-            let refined = 2 * 256 * (NODES * NODES) as u64 * 256;
-            assert!(grown < (14 << 20) + refined, "{grown}");
-            continue;
-        }
+        // Grids that a mesh is resampled to have at most 256 nodes for each of its points (docs/archives.md); two are compared, and each node
+        // takes some 220 bytes (9 MB were measured).
+        let refined = if name == "curvilinear" { 2 * 256 * (NODES * NODES) as u64 * 256 } else { 0 };
         // 7 MB were measured, on 3000 and on 30,000 mutants of files of 7 kB at most: pages of the program itself. 2^20 values that a file only
         // claims to hold would take 8 MB more as f64 alone.
-        assert!(grown < 14 << 20, "{grown}");
+        assert!(grown < (14 << 20) + refined, "{grown}");
     }
 }
 
