@@ -79,11 +79,18 @@ export class Histogram {
     // The newest record may have no colours.
     if (this.range === null || this.axis === null) return;
     const range = moved(this.range, end, value, this.axis);
-    if (range[end] === this.range[end]) return;
+    if (range[end] !== this.range[end]) this.choose(range);
+  }
+
+  /** Asks for a range, which is shown until its frame comes. */
+  choose(range) {
     [this.wanted, this.at] = [range, performance.now()];
     this.change(range);
     this.draw();
   }
+
+  /** Goes back to the range of the newest frame. */
+  forget() { this.wanted = null; }
 
   /** Takes in the newest record and colours, and asks for the counts of a newer frame. */
   refresh(record, colours) {

@@ -32,6 +32,7 @@ const steering = new Steering({
   told: (text, frame, urgent) => (urgent ? warnings.hold("command", text, frame) : warnings.log.add(text, frame)),
   // A command is followed live.
   acted: () => { if (picture.held) picture.follow(); },
+  refused: (set) => { if (set.transfer) histogram.forget(); },
 });
 
 const values = new Values({
@@ -250,17 +251,17 @@ function showSteering() {
   setText(element("obstacle"), obstacle ?? "");
   setText(element("pause"), steering.paused ? "Continue the run" : "Pause the run");
   element("pause").setAttribute("aria-pressed", String(steering.paused));
+  if (can && !document.hidden) histogram.refresh(newest, picture.kept.list.at(-1)?.header.color_bar?.colors);
   const { method, budget, tau, direction, longest_tau: longest } = steering.ready ?? {};
   for (const [id, value] of Object.entries({ method, direction })) if (document.activeElement !== element(id)) element(id).value = value ?? "";
   element("tau").max = longest ?? "";
   element("budget").disabled = method !== "two_level";
-  const values = { budget, tau, tolerance: newest?.tolerance, low: newest?.transfer?.low, high: newest?.transfer?.high };
+  const values = { budget, tau, tolerance: newest?.tolerance, ...(histogram.range ?? { low: null, high: null }) };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
   }
   setText(element("ways"), steering.flat ? "Drag moves, the wheel or two fingers zoom, a double click goes home." : "Drag turns, shift-drag or two fingers move, the wheel or two fingers zoom, a double click goes home.");
-  if (can && !document.hidden) histogram.refresh(newest, picture.kept.list.at(-1)?.header.color_bar?.colors);
 }
 
 async function save(ending) {
@@ -373,9 +374,9 @@ element("overlay-of").addEventListener("change", ({ target }) => {
   target.blur();
 });
 for (const id of ["low", "high"]) {
-  element(id).addEventListener("change", () => {
-    const [low, high] = ["low", "high"].map((end) => element(end).valueAsNumber);
-    if (Number.isFinite(low) && Number.isFinite(high)) steering.command({ transfer: { low, high } });
+  element(id).addEventListener("change", ({ target }) => {
+    // The other end may wait for its frame.
+    if (Number.isFinite(target.valueAsNumber) && histogram.range) histogram.choose({ ...histogram.range, [id]: target.valueAsNumber });
   });
 }
 

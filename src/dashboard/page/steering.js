@@ -10,9 +10,9 @@ const WHEEL = 0.0015;
 const STEP = 0.08;
 
 export class Steering {
-  /** `say(message)` sends, and returns whether it did; `told(text)` is called with what the viewer should know; `acted()` when the viewer steers. */
-  constructor({ say, told, acted }) {
-    Object.assign(this, { say, told, acted });
+  /** `say(message)` sends, and returns whether it did; `told(text)` is called with what the viewer should know; `acted()` when the viewer steers; `refused(set)` when the run refuses a command. */
+  constructor({ say, told, acted, refused }) {
+    Object.assign(this, { say, told, acted, refused });
     this.state = null;
     this.mayCommand = false;
     this.record = null;
@@ -103,6 +103,7 @@ export class Steering {
       this.settle();
     } else {
       this.told(`Refused: ${refused}`, null, true);
+      this.refused(set);
       if (set.camera !== undefined) this.wanted = this.shownBy = null;
     }
     const next = () => {

@@ -11,7 +11,7 @@ const pause = (milliseconds) => new Promise((resolve) => { setTimeout(resolve, m
 function steered() {
   const said = [];
   const told = [];
-  const steering = new Steering({ say: (message) => said.push(message), told: (text) => told.push(text), acted: () => {} });
+  const steering = new Steering({ say: (message) => said.push(message), told: (text) => told.push(text), acted: () => {}, refused: () => {} });
   steering.receiveState({ steering: { ready: ready(0) }, token_to_share: "abc" });
   steering.receiveRecords([{ frame: 1, camera, size: [96, 48], commands: [] }]);
   return { steering, said, told };
