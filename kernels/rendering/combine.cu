@@ -1,9 +1,40 @@
-// Combines the marched picture with the correction. For each half: per level combine_rows, combine_columns, combine_box (energies) and
+// Combines the marched picture with the correction. First combine_guides, combine_filter with spacings 1 and 2, combine_normal and combine_solve. For
+// each half: combine_rest, then per level combine_rows, combine_columns, combine_box (energies) and
 // combine_gains; combine_last stands in for the first two on the last level. Then combine_tiles, and, once the host has the tiles' sums,
 // combine_box (squared errors) and combine_errors.
-#include "rendering/combine.cuh"
+#include "rendering/regression.cuh"
 
 using namespace rw;
+
+extern "C" __global__ void __launch_bounds__(256) combine_guides(const Regression regression) {
+    const size_t at = size_t(blockIdx.x) * 256u + threadIdx.x;
+    if (at < size_t(regression.width) * regression.height) put_guides(regression, at);
+}
+
+// Blocks of 32 x 8 pixels. GUIDES planes each.
+extern "C" __global__ void __launch_bounds__(256)
+combine_filter(const float* __restrict__ from, float* __restrict__ to, int width, int height, int spacing) {
+    const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
+    if (x < width && y < height) filter_guides(from, to, width, height, x, y, spacing);
+}
+
+extern "C" __global__ void __launch_bounds__(256) combine_normal(const Regression regression) {
+    __shared__ float memory[STRIP_MEMORY];
+    sum_normal(Block{}, regression, int(blockIdx.x), memory);
+}
+
+// One block.
+extern "C" __global__ void __launch_bounds__(256) combine_solve(const Regression regression) {
+    __shared__ double memory[NORMAL_SUMS];
+    solve_normal(Block{}, regression, memory);
+}
+
+// rest: 6 planes; correction: 3 planes.
+extern "C" __global__ void __launch_bounds__(256)
+combine_rest(const Regression regression, int half, float* __restrict__ rest, float* __restrict__ correction) {
+    const size_t at = size_t(blockIdx.x) * 256u + threadIdx.x;
+    if (at < size_t(regression.width) * regression.height) put_rest(regression, half, at, rest, correction);
+}
 
 // Blocks of 32 x 8 pixels. rows: 8 planes, those of `fine` filtered along rows.
 extern "C" __global__ void __launch_bounds__(256)
@@ -37,9 +68,9 @@ combine_box(const float* __restrict__ from, float* __restrict__ to, int width, i
 
 // Blocks of BOX_LINES x BOX_COLUMN pixels.
 extern "C" __global__ void __launch_bounds__(256)
-combine_gains(const Level level, const float* __restrict__ sums, int radius, float* __restrict__ half, int fresh) {
+combine_gains(const Level level, const float* __restrict__ sums, int radius, float* __restrict__ half) {
     __shared__ float memory[BOX_COLUMN_MEMORY];
-    add_level(Block{}, level, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, half, fresh != 0, memory);
+    add_level(Block{}, level, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, half, memory);
 }
 
 // A block a tile.

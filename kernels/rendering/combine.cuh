@@ -150,14 +150,11 @@ RW_FN void box_columns(const Block& block, const float* from, int width, int hei
 }
 
 // Adds a level, times its gains, to the shrunk correction of a half (3 planes). `sums`: energies summed along rows.
-RW_FN void add_level(const Block& block, const Level& level, const float* sums, int x, int y, int radius, float* half, bool fresh, float* memory) {
+RW_FN void add_level(const Block& block, const Level& level, const float* sums, int x, int y, int radius, float* half, float* memory) {
     const size_t pixels = size_t(level.width) * level.height;
     box_columns(block, sums, level.width, level.height, x, y, radius, memory, [&](size_t at, float signal, float energy) {
         const float gain = gain_of(signal, energy);
-        for (int k = 0; k < 3; ++k) {
-            const float part = gain * level.mean[k * pixels + at];
-            half[k * pixels + at] = fresh ? part : half[k * pixels + at] + part;
-        }
+        for (int k = 0; k < 3; ++k) half[k * pixels + at] += gain * level.mean[k * pixels + at];
     });
 }
 

@@ -4,7 +4,7 @@
 #include <string>
 #include <vector>
 
-#include "rendering/combine.cuh"
+#include "rendering/regression.cuh"
 
 using namespace rw;
 
@@ -157,11 +157,27 @@ int main(int, char** arguments) {
                 }
             }
         };
+        const int blocks = 3;
+        std::vector<float> guides(GUIDES * pixels, NAN), around(GUIDES * pixels, NAN), scratch(GUIDES * pixels, NAN), strip(STRIP_MEMORY, NAN);
+        std::vector<double> partial(NORMAL_SUMS * blocks, NAN), coefficients(2 * FEATURES, NAN), normal(NORMAL_SUMS, NAN);
+        const Regression regression = {sums.data(),    base.data(),         guides.data(), around.data(), scratch.data(),
+                                       partial.data(), coefficients.data(), c.per_ray,     width,         height,         blocks, 0};
+        for (size_t at = 0; at < pixels; ++at) put_guides(regression, at);
+        for (int spacing = 1; spacing < 3; ++spacing) {
+            const float* from = spacing == 1 ? guides.data() : scratch.data();
+            for (int y = 0; y < height; ++y) {
+                for (int x = 0; x < width; ++x) filter_guides(from, spacing == 1 ? scratch.data() : around.data(), width, height, x, y, spacing);
+            }
+        }
+        for (int number = 0; number < blocks; ++number) sum_normal(block, regression, number, strip.data());
+        solve_normal(block, regression, normal.data());
+        std::vector<float> rest(6 * pixels, NAN);
         for (int half = 0; half < 2; ++half) {
+            for (size_t at = 0; at < pixels; ++at) put_rest(regression, half, at, rest.data(), halves.data() + 3 * half * pixels);
             Quarters fine = {}, filtered = {};
             for (int q = 0; q < 2; ++q) {
                 for (int k = 0; k < 4; ++k) {
-                    fine.planes[q][k] = sums.data() + (k == 3 ? PAIR_COUNTS + q : 6 * half + 3 * q + k) * pixels;
+                    fine.planes[q][k] = k == 3 ? sums.data() + (PAIR_COUNTS + q) * pixels : rest.data() + (3 * q + k) * pixels;
                     filtered.planes[q][k] = coarse.data() + (4 * q + k) * pixels;
                 }
             }
@@ -184,7 +200,7 @@ int main(int, char** arguments) {
                 box_rows(energy.data(), radius);
                 for (int y = 0; y < height; y += BOX_COLUMN) {
                     for (int x = 0; x < width; x += BOX_LINES) {
-                        add_level(block, level, boxed.data(), x, y, radius, halves.data() + 3 * half * pixels, number == 0, column_memory.data());
+                        add_level(block, level, boxed.data(), x, y, radius, halves.data() + 3 * half * pixels, column_memory.data());
                     }
                 }
                 fine = filtered;

@@ -1,12 +1,13 @@
 //! Combination of the marched picture with its noisy correction, and the error of the result.
 //!
-//! The correction is shrunk before it is added, as Stein-type estimators combine a biased estimate with an unbiased one (James and Stein 1961; Back
+//! First goes the part that the marched picture tells (see `regression`). The rest is shrunk before it is added, as Stein-type estimators combine a biased estimate with an unbiased one (James and Stein 1961; Back
 //! et al. 2020), here in the scales of an a-trous B3-spline transform (Starck and Murtagh 2006). The samples form two halves, and each half two
 //! quarters. The product of two quarters' details estimates the energy of the correction itself without noise, their squares that of correction
 //! and noise together; the ratio is the gain. Each half is shrunk by its own gains, so that the other half is independent of it and scores it:
 //! with d_A and d_B the means of the halves at a pixel, r = (a + b) / 2 the correction shown and c its expectation,
 //! r^2 - (a d_B + b d_A) + d_A d_B is an unbiased estimate of (r - c)^2. As samples come, gains go to 1 wherever there is anything to correct.
 
+use super::regression::Guides;
 use super::tone::ToneMap;
 use rayon::prelude::*;
 
@@ -78,18 +79,18 @@ fn reflected(mut i: isize, n: usize) -> usize {
 }
 
 /// B3-spline filter with the given spacing along one axis of a picture with rows of `width`.
-fn b3(from: &[Weighted], width: usize, spacing: usize, along_rows: bool) -> Vec<Weighted> {
+pub(super) fn b3<const N: usize>(from: &[[f32; N]], width: usize, spacing: usize, along_rows: bool) -> Vec<[f32; N]> {
     const KERNEL: [f32; 5] = [0.0625, 0.25, 0.375, 0.25, 0.0625];
     let height = from.len() / width;
-    let mut to = vec![[0.0; 4]; from.len()];
+    let mut to = vec![[0.0; N]; from.len()];
     to.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
         let rows: [usize; 5] = std::array::from_fn(|i| reflected(y as isize + (i as isize - 2) * spacing as isize, height) * width);
         for (x, value) in row.iter_mut().enumerate() {
-            let mut sum = [0.0; 4];
+            let mut sum = [0.0; N];
             for (i, weight) in KERNEL.iter().enumerate() {
                 let at =
                     if along_rows { y * width + reflected(x as isize + (i as isize - 2) * spacing as isize, width) } else { rows[i] + x };
-                (0..4).for_each(|k| sum[k] += weight * from[at][k]);
+                (0..N).for_each(|k| sum[k] += weight * from[at][k]);
             }
             *value = sum;
         }
@@ -199,17 +200,26 @@ pub struct Combined {
     how: Correction,
 }
 
-/// The correction of `sums` (row by row, `width` pixels each) and its squared error, from the products of differences between halves.
-pub fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
-    let shrunk = [0, 1].map(|half| {
+/// The correction of `sums` (row by row from the top) of the marched picture of `guides`, and its squared error, from the products of differences
+/// between halves.
+pub fn combine(sums: &[PairSums], guides: &Guides, how: Correction) -> Combined {
+    let coefficients = guides.fit(sums);
+    let shrunk = [0, 1].map(|half: usize| {
+        let regressed = |i: usize| guides.correction(i, &coefficients[half]);
         let quarter = |quarter: usize| -> Vec<Weighted> {
-            let weighted = |sums: &PairSums| {
-                let [r, g, b] = sums.radiance[half][quarter];
-                [r, g, b, sums.pairs[quarter] as f32]
+            let rest = |(i, sums): (usize, &PairSums)| {
+                let (regressed, pairs) = (regressed(i), sums.pairs[quarter] as f32);
+                let [r, g, b] = std::array::from_fn(|k| sums.radiance[half][quarter][k] - pairs * regressed[k]);
+                [r, g, b, pairs]
             };
-            sums.par_iter().map(weighted).collect()
+            sums.par_iter().enumerate().with_min_len(1 << 12).map(rest).collect()
         };
-        shrunk([quarter(0), quarter(1)], width)
+        let mut shrunk = shrunk([quarter(0), quarter(1)], guides.width);
+        shrunk.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, shrunk)| {
+            let regressed = regressed(i);
+            (0..3).for_each(|k| shrunk[k] += regressed[k]);
+        });
+        shrunk
     });
     let mut combined = Combined { correction: Vec::new(), squared: Vec::new(), shrunk, how };
     let at = |i: usize| {
@@ -283,6 +293,7 @@ pub fn smoothed(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
 mod tests {
     use super::*;
     use crate::rng::{philox, unit};
+    use crate::smooth::RaySum;
 
     /// Pairs of a picture whose correction is `truth`, with uniform noise of standard deviation `noise`.
     fn sampled(truth: &[f32], noise: f32, pairs: u32, seed: u32) -> Vec<PairSums> {
@@ -321,6 +332,11 @@ mod tests {
         sum / f64::from(count)
     }
 
+    /// A march that shows nothing, which gives no features.
+    fn dark(width: usize, height: usize) -> Guides {
+        Guides::new(&vec![RaySum::default(); width * height], 1, width)
+    }
+
     fn error_of(combined: &Combined, truth: &[f32]) -> f64 {
         mean_square(combined.correction.iter().zip(truth).map(|(r, t)| r[0] - t))
     }
@@ -330,11 +346,12 @@ mod tests {
         let (width, height) = (128, 96);
         let truth = bump(width, height);
         let left = mean_square(truth.iter().copied());
+        let guides = dark(width, height);
         let mut last = f64::INFINITY;
         for pairs in [2, 8, 32, 128] {
             let sums = sampled(&truth, 0.5, pairs, 3);
-            let shrunk = error_of(&combine(&sums, width, Correction::Shrunk), &truth);
-            let summed = error_of(&combine(&sums, width, Correction::Summed), &truth);
+            let shrunk = error_of(&combine(&sums, &guides, Correction::Shrunk), &truth);
+            let summed = error_of(&combine(&sums, &guides, Correction::Summed), &truth);
             // 0.25 / samples is the variance of the plain mean.
             assert!((summed / (0.25 / (2.0 * f64::from(pairs))) - 1.0).abs() < 0.1, "{pairs}: {summed}");
             assert!(shrunk < 0.2 * summed && shrunk < left && shrunk < last, "{pairs}: {shrunk}, sum {summed}, none {left}");
@@ -342,10 +359,33 @@ mod tests {
         }
     }
 
+    /// A correction that the marched picture tells is found at once, where shrinkage leaves most of it away; and its error is stated right.
+    #[test]
+    fn what_the_marched_picture_tells_is_regressed() {
+        let (width, height) = (128, 96);
+        // Detail of single pixels, which shrinkage takes for noise.
+        let shown: Vec<f32> = (0..width * height).map(|i| unit(philox([i as u32, 0, 0, 0], [7, 2])[0])).collect();
+        let truth: Vec<f32> = shown.iter().map(|shown| 0.3 * shown - 0.1).collect();
+        let ray = |shown: &f32| RaySum { radiance: [*shown; 3], alpha: 1.0, ..RaySum::default() };
+        let guides = Guides::new(&shown.iter().map(ray).collect::<Vec<_>>(), 1, width);
+        let (mut stated, mut found, mut without) = (0.0, 0.0, 0.0);
+        for seed in 0..8 {
+            let sums = sampled(&truth, 0.5, 2, 40 + seed);
+            let combined = combine(&sums, &guides, Correction::Shrunk);
+            stated += combined.squared.iter().map(|e| f64::from(e[0][0])).sum::<f64>() / truth.len() as f64;
+            found += error_of(&combined, &truth);
+            without += error_of(&combine(&sums, &dark(width, height), Correction::Shrunk), &truth);
+        }
+        assert!(found < 0.1 * without, "{found} {without}");
+        // Its scatter is that of the products of noise, 0.25 / 4 a pixel and half.
+        let scatter = 3.0 * 8.0 * 0.25 / 2.0 / ((8 * truth.len()) as f64).sqrt();
+        assert!((stated - found).abs() < scatter, "{stated} {found} {scatter}");
+    }
+
     #[test]
     fn noise_without_a_correction_is_shrunk_to_almost_nothing() {
         let sums = sampled(&vec![0.0; 128 * 96], 0.5, 4, 9);
-        let error = mean_square(combine(&sums, 128, Correction::Shrunk).correction.iter().map(|r| r[0]));
+        let error = mean_square(combine(&sums, &dark(128, 96), Correction::Shrunk).correction.iter().map(|r| r[0]));
         // The plain mean has 0.25 / 8, of which less than a twentieth may stay.
         assert!(error < 0.05 * 0.25 / 8.0, "{error}");
     }
@@ -361,7 +401,7 @@ mod tests {
             let (mut stated, mut found) = (0.0, 0.0);
             for seed in 0..8 {
                 let sums = sampled(&truth, 0.05, 8, 200 + seed);
-                let combined = combine(&sums, width, how);
+                let combined = combine(&sums, &dark(width, height), how);
                 let squared = |i: usize| f64::from(combined.squared_in(Some(map), i, &sums[i], [base; 3])[0][0]);
                 stated += (0..sums.len()).map(squared).sum::<f64>() / sums.len() as f64;
                 let apart = |i: usize| mapped(base + combined.correction[i][0]) - mapped(base + truth[i]);
@@ -380,7 +420,7 @@ mod tests {
         for how in [Correction::Left, Correction::Shrunk, Correction::Summed] {
             let (mut stated, mut found) = (0.0, 0.0);
             for seed in 0..24 {
-                let combined = combine(&sampled(&truth, 0.3, 8, 100 + seed), width, how);
+                let combined = combine(&sampled(&truth, 0.3, 8, 100 + seed), &dark(width, height), how);
                 stated += combined.squared.iter().map(|e| f64::from(e[0][0])).sum::<f64>() / truth.len() as f64;
                 found += error_of(&combined, &truth);
             }

@@ -14,6 +14,7 @@ mod march_control;
 mod medium;
 mod nodes;
 mod picture;
+mod regression;
 mod statement;
 mod tone;
 
@@ -25,6 +26,7 @@ pub use march::{RaySum, ToLight};
 pub use medium::{IsMissing, Medium, node_spacing};
 pub use nodes::{BRICK, Nodes};
 pub use picture::{Picture, Refinement};
+pub use regression::Guides;
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},

@@ -8,6 +8,7 @@ use super::march::{RaySum, ToLight};
 use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
+use super::regression::Guides;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
 use super::tone::ToneMap;
 use crate::renderer::RenderStats;
@@ -120,7 +121,7 @@ impl Picture {
             (_, true) => Correction::Summed,
             (_, false) => Correction::Shrunk,
         };
-        let combined = combine(&self.sums, width, how);
+        let combined = combine(&self.sums, &Guides::new(&self.base, self.march.rays, width), how);
         let (film, error) = loop {
             let (film, error, tiles) = self.film(scene, width, height, how, &combined);
             // Samples that go where earlier ones saw a difference would make their mean biased (Kirk and Arvo 1991).

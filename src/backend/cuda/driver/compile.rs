@@ -48,6 +48,7 @@ const HEADERS: &[(&str, &str)] = kernel_files![
     "rendering/camera.cuh",
     "rendering/coupled.cuh",
     "rendering/combine.cuh",
+    "rendering/regression.cuh",
     "rendering/film.cuh",
     "rendering/gate.cuh",
     "rendering/light.cuh",

@@ -24,6 +24,15 @@ const BOX_COLUMNS: [usize; 2] = [16, 128];
 const PAIR_COUNTS: usize = 12;
 /// Floats of a pixel of the film.
 const FILM_PLANES: usize = 8;
+/// Of `regression.cuh`: features, sums of the normal equations.
+const FEATURES: usize = 7;
+const NORMAL_SUMS: usize = FEATURES * (FEATURES + 1) / 2 + 2 * FEATURES + 1;
+/// Pixels that a block sums at a time.
+const STRIP: usize = 256;
+/// Blocks that sum the normal equations: some for each multiprocessor.
+const NORMAL_BLOCKS: usize = 1024;
+/// Spacings of the filter of the guides.
+const SPACINGS: [i32; 2] = [1, 2];
 
 /// `Quarters` of `combine.cuh`.
 #[repr(C)]
@@ -61,12 +70,31 @@ struct CombineArgument {
     pad: i32,
 }
 
+/// `Regression` of `regression.cuh`.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct RegressionArgument {
+    sums: u64,
+    base: u64,
+    guides: u64,
+    around: u64,
+    scratch: u64,
+    partial: u64,
+    coefficients: u64,
+    per_ray: f64,
+    width: i32,
+    height: i32,
+    blocks: i32,
+    pad: i32,
+}
+
 const _: () = assert!(size_of::<QuartersArgument>() == 64 && size_of::<LevelArgument>() == 24 && size_of::<CombineArgument>() == 88);
+const _: () = assert!(size_of::<RegressionArgument>() == 80);
 
 const TILE_FIELDS: usize = size_of::<TileSums>() / size_of::<f32>();
 const _: () = assert!(TILE_FIELDS == 23);
 
-device_repr!(QuartersArgument, LevelArgument, CombineArgument);
+device_repr!(QuartersArgument, LevelArgument, CombineArgument, RegressionArgument);
 
 /// What is combined.
 pub struct CombineInput<'a> {
@@ -110,14 +138,36 @@ struct Planes {
     halves: usize,
     film: usize,
     squared: usize,
+    /// Guides of the regression, and what is left to be shrunk, which the first level reads before the second writes there.
+    guides: usize,
+    around: usize,
+    rest: usize,
     count: usize,
 }
 
-const PLANES: Planes = Planes { coarse: [0, 29], rows: 8, energy: 16, boxed: 18, mean: 20, halves: 23, film: 0, squared: 8, count: 37 };
+const PLANES: Planes = Planes {
+    coarse: [0, 29],
+    rows: 8,
+    energy: 16,
+    boxed: 18,
+    mean: 20,
+    halves: 23,
+    film: 0,
+    squared: 8,
+    guides: 37,
+    around: 42,
+    rest: 29,
+    count: 47,
+};
 
-/// Combines pictures. It reuses its memory between frames: 37 planes, and the film in pinned memory.
+/// Combines pictures. It reuses its memory between frames: 47 planes, and the film in pinned memory.
 pub struct GpuCombine {
     gpu: Arc<Gpu>,
+    guides: CudaFunction,
+    filter: CudaFunction,
+    normal: CudaFunction,
+    solve: CudaFunction,
+    rest: CudaFunction,
     rows: CudaFunction,
     columns: CudaFunction,
     last: CudaFunction,
@@ -126,6 +176,8 @@ pub struct GpuCombine {
     tiles: CudaFunction,
     errors: CudaFunction,
     planes: Option<Buffer<f32>>,
+    /// Partial sums of the normal equations, then the coefficients.
+    normal_sums: Option<Buffer<f64>>,
     tile_sums: Option<Buffer<f32>>,
     tiles_read: Option<Pinned<f32>>,
     film_read: Option<Pinned<f32>>,
@@ -141,6 +193,11 @@ impl GpuCombine {
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernel = |name| gpu.kernel("combine.cu", &[], name);
         Ok(Self {
+            guides: kernel("combine_guides")?,
+            filter: kernel("combine_filter")?,
+            normal: kernel("combine_normal")?,
+            solve: kernel("combine_solve")?,
+            rest: kernel("combine_rest")?,
             rows: kernel("combine_rows")?,
             columns: kernel("combine_columns")?,
             last: kernel("combine_last")?,
@@ -150,6 +207,7 @@ impl GpuCombine {
             errors: kernel("combine_errors")?,
             gpu: gpu.clone(),
             planes: None,
+            normal_sums: None,
             tile_sums: None,
             tiles_read: None,
             film_read: None,
@@ -183,9 +241,26 @@ impl GpuCombine {
         let gpu = self.gpu.clone();
         let at = room(&gpu, &mut self.planes, "combining pictures", PLANES.count * pixels)?.address();
         let plane = |number: usize| at + (number * pixels * size_of::<f32>()) as u64;
+        let blocks_of_sums = NORMAL_BLOCKS.min(pixels.div_ceil(STRIP));
+        let partial = room(&gpu, &mut self.normal_sums, "regressing corrections", NORMAL_SUMS * blocks_of_sums + 2 * FEATURES)?.address();
+        let regression = RegressionArgument {
+            sums: input.pairs.address(),
+            base,
+            guides: plane(PLANES.guides),
+            around: plane(PLANES.around),
+            scratch: plane(PLANES.rows),
+            partial,
+            coefficients: partial + (NORMAL_SUMS * blocks_of_sums * size_of::<f64>()) as u64,
+            per_ray: 1.0 / f64::from(input.march.rays()),
+            width: width as i32,
+            height: height as i32,
+            blocks: blocks_of_sums as i32,
+            pad: 0,
+        };
+        self.regress(&regression)?;
         // Whatever is shown: the error in tone-mapped values is that of the best estimate, and its way to the picture.
         for half in 0..2 {
-            self.shrink(input, half, plane)?;
+            self.shrink(input, &regression, half, plane)?;
         }
         let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];
         let count = tiles[0] * tiles[1] * TILE_FIELDS;
@@ -222,8 +297,34 @@ impl GpuCombine {
         Ok(bytemuck::cast_slice(&read.values()[..count]))
     }
 
-    /// Shrinks the correction of a half.
-    fn shrink(&self, input: &CombineInput<'_>, half: usize, plane: impl Fn(usize) -> u64) -> Result<(), DeviceError> {
+    /// Regresses both halves' corrections on the marched picture.
+    fn regress(&self, regression: &RegressionArgument) -> Result<(), DeviceError> {
+        let (across, down) = (regression.width, regression.height);
+        let pixels = across as usize * down as usize;
+        let stream = self.gpu.work();
+        // SAFETY: the arguments of the kernels of combine.cu; each address is that of as many planes or sums as the kernel expects, in memory that is
+        // freed in the order of the stream.
+        unsafe {
+            launch(stream.launch_builder(&self.guides).arg(regression), threads(pixels, 256))?;
+            let planes = [regression.guides, regression.scratch, regression.around];
+            for (planes, spacing) in planes.windows(2).zip(&SPACINGS) {
+                let mut call = stream.launch_builder(&self.filter);
+                call.arg(&planes[0]).arg(&planes[1]).arg(&across).arg(&down).arg(spacing);
+                launch(&mut call, blocks((across as usize).div_ceil(32), (down as usize).div_ceil(8)))?;
+            }
+            launch(stream.launch_builder(&self.normal).arg(regression), blocks(regression.blocks as usize, 1))?;
+            launch(stream.launch_builder(&self.solve).arg(regression), blocks(1, 1))
+        }
+    }
+
+    /// Shrinks what the regression left of the correction of a half.
+    fn shrink(
+        &self,
+        input: &CombineInput<'_>,
+        regression: &RegressionArgument,
+        half: usize,
+        plane: impl Fn(usize) -> u64,
+    ) -> Result<(), DeviceError> {
         let [width, height] = input.size;
         let pixels = width * height;
         let stream = self.gpu.work();
@@ -231,14 +332,19 @@ impl GpuCombine {
         let level = LevelArgument { mean: plane(PLANES.mean), energy: plane(PLANES.energy), width: across, height: down };
         let (rows, boxed) = (plane(PLANES.rows), plane(PLANES.boxed));
         let shrunk = plane(PLANES.halves + 3 * half);
-        let sums = |number: usize| input.pairs.address() + (number * pixels * size_of::<f32>()) as u64;
+        let pairs = |quarter: usize| input.pairs.address() + ((PAIR_COUNTS + quarter) * pixels * size_of::<f32>()) as u64;
+        let (rest, number) = (plane(PLANES.rest), half as i32);
+        let mut call = stream.launch_builder(&self.rest);
+        call.arg(regression).arg(&number).arg(&rest).arg(&shrunk);
+        // SAFETY: the arguments of `combine_rest`; the planes are as many as it expects.
+        unsafe { launch(&mut call, threads(pixels, 256)) }?;
         let mut fine = QuartersArgument {
-            planes: [0, 1].map(|q| std::array::from_fn(|k| sums(if k == 3 { PAIR_COUNTS + q } else { 6 * half + 3 * q + k }))),
+            planes: [0, 1].map(|q| std::array::from_fn(|k| if k == 3 { pairs(q) } else { plane(PLANES.rest + 3 * q + k) })),
         };
         for number in 0..=LEVELS {
             let first = PLANES.coarse[number as usize % 2];
             let coarse = plane(first);
-            let (spacing, fresh) = (1_i32 << number, i32::from(number == 0));
+            let spacing = 1_i32 << number;
             // SAFETY: the arguments of the kernels of combine.cu; each address is that of as many planes as the kernel expects, in memory that is freed
             // in the order of the stream.
             unsafe {
@@ -253,7 +359,7 @@ impl GpuCombine {
                 }
                 self.box_rows(level.energy, boxed, input.size, RADIUS)?;
                 let mut call = stream.launch_builder(&self.gains);
-                launch(call.arg(&level).arg(&boxed).arg(&RADIUS).arg(&shrunk).arg(&fresh), box_columns(input.size))?;
+                launch(call.arg(&level).arg(&boxed).arg(&RADIUS).arg(&shrunk), box_columns(input.size))?;
             }
             fine = QuartersArgument { planes: [0, 1].map(|q| std::array::from_fn(|k| plane(first + 4 * q + k))) };
         }

@@ -6,7 +6,9 @@ use super::march::LightArgument;
 use crate::cuda::SUM_PLANES;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_render::rng::philox;
-use ridgewatch_render::smooth::{Correction, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, ToneMap, combine, smoothed};
+use ridgewatch_render::smooth::{
+    Correction, Guides, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, ToneMap, combine, smoothed,
+};
 use ridgewatch_render::{CameraSettings, Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -372,16 +374,20 @@ fn a_device_agrees() {
         let measured: f64 = tiles.iter().map(|tile| f64::from(tile.all.squared[0])).sum();
         let film = combine.finish(8, 1e-4, 0.0).unwrap();
         if how.is_none() {
-            base = film.rgba.to_vec();
+            let sum = |(&[red, green, blue, alpha], &ftle): (&[f32; 4], &f32)| {
+                let ftle = if alpha > 0.0 { ftle * alpha } else { 0.0 };
+                RaySum { radiance: [red, green, blue], alpha, ftle, missing: 0.0 }
+            };
+            base = film.rgba.iter().zip(film.ftle_mean).map(sum).collect::<Vec<RaySum>>();
         }
-        let combined = ridgewatch_render::smooth::combine(&sums, width, correction);
+        let combined = ridgewatch_render::smooth::combine(&sums, &Guides::new(&base, 1, width), correction);
         let mean: Vec<f32> = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect();
         let expected: f64 = mean.iter().filter(|e| e.is_finite()).map(|e| f64::from(*e)).sum();
         assert!((measured - expected).abs() <= 1e-3 * expected.abs() + 1e-2, "{correction:?}: {measured} and {expected}");
         let errors = smoothed(&mean, width, 8);
         for i in 0..width * height {
             for k in 0..3 {
-                let (found, expected) = (film.rgba[i][k] - base[i][k], combined.correction[i][k]);
+                let (found, expected) = (film.rgba[i][k] - base[i].radiance[k], combined.correction[i][k]);
                 assert!((found - expected).abs() <= 1e-4, "{correction:?}, pixel {i}: {found} and {expected}");
             }
             let expected = errors[i].max(1e-4).sqrt();
@@ -450,7 +456,11 @@ fn combined_pictures_agree() {
             let [ftle, error, missing, samples] = [(); 4].map(|()| read::<f32>(&mut output, pixels));
             let tiles = read::<[f32; 23]>(&mut output, width.div_ceil(16) * height.div_ceil(16));
 
-            let combined = combine(&sums, width, how);
+            let ray = |b: &[f64; 6]| {
+                let [red, green, blue, alpha, ftle, missing] = b.map(|value| value as f32);
+                RaySum { radiance: [red, green, blue], alpha, ftle, missing }
+            };
+            let combined = combine(&sums, &Guides::new(&base.iter().map(ray).collect::<Vec<_>>(), rays as u64, width), how);
             let what = format!("{width}x{height}, {how:?}");
             let same = |found: f32, expected: f32, size: f32| {
                 (found.is_nan() && expected.is_nan()) || (found - expected).abs() <= 3e-5 * (size + expected.abs())
