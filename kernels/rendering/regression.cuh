@@ -4,8 +4,8 @@
 
 namespace rw {
 
-constexpr int GUIDES = 5;  // planes: radiance, opacity, opacity times mean FTLE
-constexpr int FEATURES = 7;
+constexpr int GUIDES = 8;  // planes: radiance, opacity, opacity times mean FTLE, and that times radiance
+constexpr int FEATURES = 4;
 // The matrix above and on its diagonal, then the right-hand sides of both halves, then the pairs.
 constexpr int MATRIX_SUMS = FEATURES * (FEATURES + 1) / 2, NORMAL_SUMS = MATRIX_SUMS + 2 * FEATURES + 1;
 constexpr double RIDGE = 1e-6, FEW = 10.0;
@@ -31,7 +31,8 @@ static_assert(sizeof(Regression) == 80, "layout");
 
 RW_FN void put_guides(const Regression& r, size_t at) {
     const size_t pixels = size_t(r.width) * r.height;
-    for (int k = 0; k < GUIDES; ++k) r.guides[k * pixels + at] = float(r.base[k * pixels + at] * r.per_ray);
+    for (int k = 0; k < 5; ++k) r.guides[k * pixels + at] = float(r.base[k * pixels + at] * r.per_ray);
+    for (int k = 0; k < 3; ++k) r.guides[(5 + k) * pixels + at] = r.guides[4 * pixels + at] * r.guides[k * pixels + at];
 }
 
 // Filters GUIDES planes along both axes.
@@ -51,14 +52,11 @@ RW_FN void filter_guides(const float* from, float* to, int width, int height, in
 // Features of a pixel, by channel. All of them 0, and false, where nothing is shown around it.
 RW_FN bool features_at(const Regression& r, size_t at, float (&features)[3][FEATURES]) {
     const size_t pixels = size_t(r.width) * r.height;
-    float own[GUIDES], around[GUIDES];
-    for (int k = 0; k < GUIDES; ++k) {
-        own[k] = r.guides[k * pixels + at];
-        around[k] = r.around[k * pixels + at];
-    }
-    const bool shows = around[3] > 0.0f;
+    float details[GUIDES];
+    for (int k = 0; k < GUIDES; ++k) details[k] = r.guides[k * pixels + at] - r.around[k * pixels + at];
+    const bool shows = r.around[3 * pixels + at] > 0.0f;
     for (int k = 0; k < 3; ++k) {
-        const float of[FEATURES] = {own[k], own[3], own[4], own[4] * own[k], around[k], around[3], around[4]};
+        const float of[FEATURES] = {details[k], details[3], details[4], details[5 + k]};
         for (int i = 0; i < FEATURES; ++i) features[k][i] = shows ? of[i] : 0.0f;
     }
     return shows;

@@ -1,8 +1,9 @@
 //! Regression of the correction on the marched picture.
 //!
 //! What a surrogate errs depends on what it shows: nodes smooth a ridge, so its crest is missing where the picture is brighter than its surroundings.
-//! Of the correction that is a linear function of a few features of the marched picture, whose coefficients all pixels give together (control variates
-//! with estimated coefficients; Rousselle et al. 2016 do so for pictures). It has nearly no noise, and what is left is smaller for the shrinkage.
+//! Of the correction that is a linear function of the picture's details, whose coefficients all pixels give together (control variates with estimated
+//! coefficients; Rousselle et al. 2016 do so for pictures). It has nearly no noise. Coarse parts of the correction, which samples show soon, are left to
+//! the shrinkage: with them as features too, they decide the coefficients, and details get worse.
 //! Coefficients are those of one half of the samples, so that the other half remains independent of what is shown.
 
 use super::combine::{PairSums, b3};
@@ -10,11 +11,11 @@ use super::march::RaySum;
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 
-/// Of a pixel of the marched picture: radiance, opacity, opacity times mean FTLE.
-type Guide = [f32; 5];
-/// Per channel: radiance, opacity, FTLE (times opacity), FTLE times radiance; the first three of the picture around it.
-const FEATURES: usize = 7;
-/// Spacings of the filter that gives the picture around a pixel.
+/// Of a pixel of the marched picture: radiance, opacity, opacity times mean FTLE, and that times radiance.
+type Guide = [f32; 8];
+/// Per channel: those four, less those of the picture around the pixel.
+const FEATURES: usize = 4;
+/// Spacings of the filter that gives the picture around a pixel. One less and one more were worse where a node covers two and three pixels.
 const SPACINGS: [usize; 2] = [1, 2];
 /// Added to the diagonal of the normal equations, which is scaled to 1. Features may depend on each other; and as many pairs as `FEW` give half of the
 /// coefficient of a single feature, since fewer than some hundred would fit their own noise. Between 3 and 30 it makes little difference.
@@ -38,7 +39,8 @@ impl Guides {
         let per_ray = 1.0 / rays.max(1) as f32;
         let guide = |sum: &RaySum| {
             let [red, green, blue] = sum.radiance;
-            [red, green, blue, sum.alpha, sum.ftle].map(|value| value * per_ray)
+            let ftle = sum.ftle * per_ray;
+            [red, green, blue, sum.alpha, sum.ftle, ftle * red, ftle * green, ftle * blue].map(|value| value * per_ray)
         };
         let own: Vec<Guide> = base.par_iter().with_min_len(1 << 12).map(guide).collect();
         let mut around = own.clone();
@@ -55,11 +57,11 @@ impl Guides {
 
     /// Features of each channel; all of them 0 where nothing is shown around the pixel.
     fn features(&self, pixel: usize) -> [[f32; FEATURES]; 3] {
-        let (own, around) = (&self.own[pixel], &self.around[pixel]);
         if !self.shows(pixel) {
             return [[0.0; FEATURES]; 3];
         }
-        std::array::from_fn(|k| [own[k], own[3], own[4], own[4] * own[k], around[k], around[3], around[4]])
+        let (own, around) = (&self.own[pixel], &self.around[pixel]);
+        std::array::from_fn(|k| [k, 3, 4, 5 + k].map(|guide| own[guide] - around[guide]))
     }
 
     /// Coefficients of both halves: least squares over pixels and channels, each pixel weighted by its pairs.
