@@ -23,11 +23,6 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
             files.push(url.into());
             continue;
         }
-        if let Some((scheme, _)) = text.split_once("://").filter(|(scheme, _)| scheme.bytes().all(|b| b.is_ascii_alphanumeric())) {
-            let accepted = "accepted are `https://` and `http://`; object stores have such URLs too, as \
-                            `https://BUCKET.s3.REGION.amazonaws.com/KEY` and `https://storage.googleapis.com/BUCKET/KEY`";
-            return Err(SourceError::file(Path::new(&format!("{scheme}://...")), accepted));
-        }
         refuse_dangling(path)?;
         if is_called_store(path) {
             files.push(path.clone());

@@ -39,9 +39,10 @@ const MAX_CERTIFICATES: u64 = 16 << 20;
 /// What is accepted of URLs, for messages.
 pub const ACCEPTED_URLS: &str = "URLs of Zarr stores, such as `https://HOST/PATH/x.zarr`";
 
-/// Whether a path is a URL that is read over HTTP.
+/// Whether a path is a URL. [`checked_url`] says whether it is accepted.
 pub fn is_url(path: &Path) -> bool {
-    path.to_str().and_then(|text| text.split_once("://")).is_some_and(|(scheme, _)| ["http", "https"].contains(&&*scheme.to_lowercase()))
+    let scheme = path.to_str().and_then(|text| text.split_once("://")).map_or("", |(scheme, _)| scheme);
+    !scheme.is_empty() && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"+-.".contains(&byte))
 }
 
 /// The URL of a store as it is shown and recorded: without a slash at its end.
@@ -53,6 +54,10 @@ pub fn checked_url(url: &str) -> Result<String, (String, String)> {
     let known = rest.split(['?', '#']).next().unwrap_or_default();
     let shown = format!("{scheme}://{}", if rest.contains('@') { "..." } else { known });
     let refused = |what: &str| Err((shown.clone(), what.to_owned()));
+    if !["http", "https"].iter().any(|known| scheme.eq_ignore_ascii_case(known)) {
+        let accepted = "accepted are `https://` and `http://`; object stores have such URLs too";
+        return refused(&format!("{accepted}: `https://BUCKET.s3.REGION.amazonaws.com/KEY`, `https://storage.googleapis.com/BUCKET/KEY`"));
+    }
     let (authority, path) = known.split_once('/').unwrap_or((known, ""));
     if authority.contains('@') {
         let accepted = "it names a user, and messages and records show URLs: leave out what is before `@`, and set";
@@ -472,7 +477,15 @@ mod tests {
     #[test]
     fn urls_are_told_from_paths_and_checked() {
         let is = |text: &str| is_url(Path::new(text));
-        assert!(is("https://a.b/x.zarr") && is("HTTP://a") && !is("x.zarr") && !is("s3://a/b") && !is("/https/x") && !is("http:/a"));
+        assert!(
+            is("https://a.b/x.zarr")
+                && is("HTTP://a")
+                && !is("x.zarr")
+                && is("s3://a/b")
+                && !is("://a")
+                && !is("/https/x")
+                && !is("http:/a")
+        );
         assert_eq!(checked_url("https://a.b:81/c d".replace(' ', "%20").as_str()), Ok("https://a.b:81/c%20d".into()));
         assert_eq!(checked_url("http://[::1]:8000/x.zarr//"), Ok("http://[::1]:8000/x.zarr".into()));
         for (url, shown, what) in [
@@ -483,6 +496,7 @@ mod tests {
             ("https://a/x#secret", "https://a/x", "queries"),
             ("https://a/*.zarr", "https://a/*.zarr", "is a pattern"),
             ("https://a/x y", "https://a/x y", "%20"),
+            ("s3://a/x", "s3://a/x", "amazonaws.com"),
             ("https:///x", "https:///x", "has no host"),
         ] {
             let found = checked_url(url).unwrap_err();
