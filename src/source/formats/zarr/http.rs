@@ -489,18 +489,18 @@ mod tests {
         assert_eq!(checked_url("https://a.b:81/c d".replace(' ', "%20").as_str()), Ok("https://a.b:81/c%20d".into()));
         assert_eq!(checked_url("http://[::1]:8000/x.zarr//"), Ok("http://[::1]:8000/x.zarr".into()));
         for (url, shown, what) in [
-            ("https://me:secret@a/x", "https://...", "names a user"),
-            ("https://me:sec/ret@a/x", "https://...", "has no host"),
-            ("https://a/x?sig=secret", "https://a/x", "queries"),
-            ("https://a/x?sig=secret@b", "https://...", "queries"),
-            ("https://a/x#secret", "https://a/x", "queries"),
+            ("https://me:hunter2@a/x", "https://...", "names a user"),
+            ("https://me:hun/ter2@a/x", "https://...", "has no host"),
+            ("https://a/x?sig=hunter2", "https://a/x", "queries"),
+            ("https://a/x?sig=hunter2@b", "https://...", "queries"),
+            ("https://a/x#hunter2", "https://a/x", "queries"),
             ("https://a/*.zarr", "https://a/*.zarr", "is a pattern"),
             ("https://a/x y", "https://a/x y", "%20"),
             ("s3://a/x", "s3://a/x", "amazonaws.com"),
             ("https:///x", "https:///x", "has no host"),
         ] {
             let found = checked_url(url).unwrap_err();
-            assert!(found.0 == shown && found.1.contains(what) && !found.1.contains("secret"), "{url}: {found:?}");
+            assert!(found.0 == shown && found.1.contains(what) && !found.1.contains("hunter2"), "{url}: {found:?}");
         }
     }
 
