@@ -17,7 +17,7 @@ use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSetti
 use crate::run::{Settings, TimeSettings, TrainingSettings};
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
-use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};
+use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings, is_url};
 use crate::surrogate::network::{Encoding, Loss, NetworkSettings, Size, Target};
 use crate::surrogate::{Kind, SurrogateSettings};
 use crate::trust::TrustSettings;
@@ -114,7 +114,7 @@ fn keys_of(table: &toml::Table) -> Vec<String> {
 impl SceneFile {
     /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
     ///
-    /// Relative paths start at the folder of the scene file. Paths of `overrides`, and the one path that is written to, start at the working
+    /// Relative paths start at the folder of the scene file; URLs stay as they are. Paths of `overrides`, and the one path that is written to, start at the working
     /// directory.
     ///
     /// # Errors
@@ -145,7 +145,7 @@ impl SceneFile {
         let folder = path.parent().unwrap_or(Path::new("."));
         let origin = scene.origin.clone();
         for (key, file) in scene.paths() {
-            if file.is_relative() && key != WRITTEN && !origin.sets(key) {
+            if file.is_relative() && !is_url(file) && key != WRITTEN && !origin.sets(key) {
                 *file = folder.join(&*file);
             }
         }
@@ -270,7 +270,7 @@ impl SceneFile {
         let mut scene = self.clone();
         for (key, path) in scene.paths() {
             let refused = |why: &str| unwritable(format!("`{key}` is {path:?}: {why}"));
-            let whole = std::path::absolute(&*path).map_err(|e| refused(&e.to_string()))?;
+            let whole = if is_url(path) { path.clone() } else { std::path::absolute(&*path).map_err(|e| refused(&e.to_string()))? };
             whole.to_str().ok_or_else(|| refused("not UTF-8"))?;
             *path = whole;
         }

@@ -18,7 +18,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(60);
 /// Options of `chart`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// Seconds for all measurements. What did not fit is named.

@@ -18,7 +18,7 @@ use std::sync::atomic::AtomicBool;
 /// Options of `ftle`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions. Default of NZ: the number of levels of the

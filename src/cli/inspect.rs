@@ -11,7 +11,7 @@ use std::path::PathBuf;
 /// Options of `inspect`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// Data files or globs, or a scene file (.toml) of kind archive.
+    /// Data files, globs or URLs of Zarr stores, or a scene file (.toml) of kind archive.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Integration time for which the memory of the window is stated, in seconds or with a unit, e.g. "30 days"; default: the scene's

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// Options of `map`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// Picture: .png or .svg. A record of the same name that ends in .json is written beside it.

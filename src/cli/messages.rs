@@ -11,7 +11,11 @@ pub fn start(verbose: u8) {
         1 => "ridgewatch=info",
         _ => "ridgewatch=debug",
     };
-    let filter = EnvFilter::try_from_env("RIDGEWATCH_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+    let mut filter = EnvFilter::try_from_env("RIDGEWATCH_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+    // Below this level they write out what is sent, credentials included.
+    for quiet in ["ureq=info", "ureq_proto=info", "rustls=info"] {
+        filter = quiet.parse().into_iter().fold(filter, EnvFilter::add_directive);
+    }
     let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(stderr)

@@ -15,7 +15,7 @@ use std::sync::atomic::AtomicBool;
 /// Options of `render`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.

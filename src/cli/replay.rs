@@ -8,7 +8,7 @@ use std::path::PathBuf;
 /// Options of `replay`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs, which get the defaults.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores, which get the defaults.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     #[command(flatten)]

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 /// Options of `ridges`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// File of the ridges. In three dimensions .vtp (VTK PolyData) or .ply; in two .geojson, .nc (CF geometries) or .vtk.

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// Options of `train`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files and globs. The surrogate is the scene's (surrogate.kind network or residual).
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores. The surrogate is the scene's (surrogate.kind network or residual).
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// Passes over the labels.

@@ -52,7 +52,14 @@ impl Origin {
             let mut keys = std::iter::once(&refused.key).chain(&refused.beside);
             keys.any(|key| key.strip_prefix(set).is_some_and(|rest| rest.is_empty() || rest.starts_with('.')))
         };
+        // A URL may hold a secret: the message shows what may be shown, and its line or option nothing more.
+        let hidden = refused.key == "archive.files" && refused.found.contains("://");
         match self.options.iter().rev().find(|(key, _)| at_fault(key)) {
+            Some((key, _)) if hidden => ConfigError::Fault { place: format!("--set {key}"), message, line: None },
+            None if hidden => {
+                let number = self.offset_of(&refused.key).map_or_else(String::new, |at| format!(":{}", self.line_at(at).0));
+                ConfigError::Fault { place: format!("{}{number}", self.path.display()), message, line: None }
+            }
             Some((_, option)) => ConfigError::Fault { place: option.clone(), message, line: None },
             None => self.at_line(message, self.offset_of(&refused.key).map(|at| self.line_at(at))),
         }

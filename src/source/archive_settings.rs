@@ -130,7 +130,7 @@ impl SyntheticSettings {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ArchiveSettings {
-    /// Files, folders and patterns: one or a list.
+    /// Files, folders, patterns and URLs of Zarr stores: one or a list.
     #[serde(deserialize_with = "one_or_many")]
     pub files: Vec<PathBuf>,
     /// Variable of the velocity along x (eastward).

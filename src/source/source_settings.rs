@@ -1,6 +1,7 @@
 //! `[source]` and `[domain]` of a scene file: kind of velocity, and the box of a closed form.
 
 use super::archive_settings::ArchiveSettings;
+use super::formats::{ACCEPTED_URLS, checked_url, is_url};
 use ridgewatch_base::setting::{Refused, count, require, shown};
 use serde::{Deserialize, Serialize};
 
@@ -136,6 +137,12 @@ impl SourceSettings {
         }
         if kind == Archive && archive.files.is_empty() && archive.synthetic.is_none() {
             fault("archive.files", "is empty", "a list of files or globs, or a table [archive.synthetic]")?;
+        }
+        // Before a scene is written anywhere: a URL may hold a secret.
+        for url in archive.files.iter().filter(|path| is_url(path)) {
+            if let Err((shown, what)) = checked_url(&url.to_string_lossy()) {
+                fault("archive.files", format!("holds {shown}: {what}"), ACCEPTED_URLS)?;
+            }
         }
         Ok(())
     }

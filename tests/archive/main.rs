@@ -5,6 +5,7 @@ mod curvilinear;
 mod grib;
 mod hdf5;
 mod hemispheres;
+mod http;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod land;

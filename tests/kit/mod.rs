@@ -5,6 +5,7 @@
 pub mod flow;
 pub mod grib;
 pub mod grids;
+pub mod http;
 pub mod mutants;
 pub mod netcdf;
 pub mod program;

@@ -1,16 +1,16 @@
 //! Files, folders and patterns as a list of files. A Zarr store is a folder that counts as one file.
 
 use crate::error::SourceError;
-use crate::formats::{FormatFault, is_store};
+use crate::formats::{FormatFault, checked_url, is_store, is_url};
 use std::path::{Path, PathBuf};
 
 /// Extensions of the files that are taken from a folder.
 const EXTENSIONS: [&str; 12] = ["nc", "nc4", "cdf", "netcdf", "h5", "hdf5", "hdf", "grib", "grib1", "grib2", "grb", "grb2"];
 
-/// Expands folders and patterns, in name order. A file that is named twice counts once.
+/// Expands folders and patterns, in name order. A file that is named twice counts once. URLs of stores stay as they are.
 ///
 /// # Errors
-/// No paths; a folder or pattern without files, or that cannot be read.
+/// No paths; a folder or pattern without files, or that cannot be read; a URL that is not accepted.
 pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     if paths.is_empty() {
         return Err(SourceError::NoFiles);
@@ -18,6 +18,11 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     let mut files: Vec<PathBuf> = Vec::new();
     for path in paths {
         let text = path.to_string_lossy();
+        if is_url(path) {
+            let url = checked_url(&text).map_err(|(shown, what)| SourceError::file(Path::new(&shown), what))?;
+            files.push(url.into());
+            continue;
+        }
         refuse_dangling(path)?;
         if is_called_store(path) {
             files.push(path.clone());

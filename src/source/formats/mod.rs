@@ -28,4 +28,4 @@ pub use libraries::{hdf5_version, netcdf_version};
 pub use limits::Limits;
 pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, UNREADABLE, Variable};
 pub use write::{NewVariable, Values, write_hdf5, write_netcdf};
-pub use zarr::is_store;
+pub use zarr::{ACCEPTED_URLS, checked_url, is_store, is_url};

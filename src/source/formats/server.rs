@@ -8,7 +8,7 @@ use super::messages::{Description, Format, FormatError, FormatFault, Listing, Nu
 use super::netcdf4::NetCdf4Store;
 use super::scan::{Chunks, scan};
 use super::store::Store;
-use super::zarr::ZarrStore;
+use super::zarr::{ZarrStore, is_url};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -71,6 +71,9 @@ impl OpenFile {
     fn open(path: &Path, expected: Option<&Listing>, limits: &Limits) -> Result<Self, FormatError> {
         let failed = |cause: std::io::Error| FormatFault::Open(cause.to_string()).of(path);
         let zarr = |(listing, store, chunks)| Self { listing, store: Box::new(store) as Box<dyn Store>, chunks };
+        if let Some(url) = path.to_str().filter(|_| is_url(path)) {
+            return ZarrStore::open_url(path, url, limits).map(zarr);
+        }
         if path.is_dir() {
             return ZarrStore::open_folder(path, limits).map(zarr);
         }

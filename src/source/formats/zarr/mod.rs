@@ -1,4 +1,4 @@
-//! Zarr, versions 2 and 3: folders and zip files, consolidated or not, read chunk by chunk.
+//! Zarr, versions 2 and 3: folders and zip files, consolidated or not, and consolidated ones behind URLs, read chunk by chunk.
 //!
 //! Without the crate `zarrs`: its codecs unpack whatever a chunk holds, however much that is, and its features of other crates change
 //! the whole program. The codecs here come from crates and are bounded by what the metadata declare.
@@ -7,6 +7,7 @@
 
 mod cache;
 mod codecs;
+mod http;
 mod json;
 mod metadata;
 mod parts;
@@ -18,14 +19,19 @@ use super::scan::Chunks;
 use super::store::{Store, advance};
 use cache::Cache;
 use codecs::{most_stored, unpack};
+use http::HttpParts;
+pub use http::{ACCEPTED_URLS, checked_url, is_url};
 use metadata::{Array, Codecs, Shard, collect};
 pub use parts::is_store;
 use parts::{FolderParts, Parts, Span, ZipParts, within};
 use serde_json::Value;
 use std::cell::{Cell, RefCell};
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::sync_channel;
 
 /// Chunks that one request may reach: each costs at least a look into a folder.
 const MAX_CHUNKS: u64 = 1 << 20;
@@ -37,6 +43,13 @@ const MAX_NAME: usize = 4096;
 const ROOT: &str = "array";
 /// The share of the memory in which unpacked chunks are kept: a fourth.
 const CACHE_SHARE: u64 = 4;
+/// The share of the memory for parts that are asked for at once: an eighth.
+const AT_ONCE_SHARE: u64 = 8;
+/// Chunks whose names are held while they are asked for at once.
+const BATCH: usize = 512;
+
+/// An index of a shard; `None` if the shard is not stored.
+type Index = Option<Arc<Vec<u8>>>;
 
 /// An open store.
 pub struct ZarrStore {
@@ -45,14 +58,23 @@ pub struct ZarrStore {
     /// In the order of the listing.
     arrays: Vec<(String, Array)>,
     cache: RefCell<Cache>,
+    /// Bytes for parts that are asked for at once.
+    at_once: u64,
     /// Parts read, their bytes, and chunks unpacked.
     counts: Cell<[u64; 3]>,
+    /// Bytes of the values that were asked for, unpacked.
+    needed: Cell<u64>,
 }
 
 impl Drop for ZarrStore {
     fn drop(&mut self) {
         let [parts, bytes, unpacked] = self.counts.get();
-        tracing::debug!("{}: read {bytes} bytes of {parts} parts, unpacked {unpacked} chunks", self.path.display());
+        let (needed, requests) = (self.needed.get(), self.parts.requests());
+        let asked = if requests > 0 { format!(" in {requests} requests") } else { String::new() };
+        tracing::debug!(
+            "{}: read {bytes} bytes of {parts} parts{asked}, unpacked {unpacked} chunks, for values of {needed} bytes",
+            self.path.display()
+        );
     }
 }
 
@@ -71,6 +93,14 @@ impl ZarrStore {
     /// As for folders.
     pub fn open_zip(path: &Path, file: File, limits: &Limits) -> Result<(Listing, Self, Chunks), FormatError> {
         Self::open(path, limits, || Ok(Box::new(ZipParts::open(file, limits)?)))
+    }
+
+    /// Opens a store behind a URL that was checked, see [`checked_url`].
+    ///
+    /// # Errors
+    /// As for folders; a server that does not answer, and a group without consolidated metadata.
+    pub fn open_url(path: &Path, url: &str, limits: &Limits) -> Result<(Listing, Self, Chunks), FormatError> {
+        Self::open(path, limits, || Ok(Box::new(HttpParts::open(url)?)))
     }
 
     fn open(
@@ -103,17 +133,51 @@ impl ZarrStore {
             }
         }
         let cache = RefCell::new(Cache::new(limits.memory / CACHE_SHARE));
-        Ok((listing, Self { path: path.into(), parts, arrays, cache, counts: Cell::default() }, chunks))
+        let at_once = limits.memory / AT_ONCE_SHARE;
+        let (counts, needed) = (Cell::default(), Cell::default());
+        Ok((listing, Self { path: path.into(), parts, arrays, cache, at_once, counts, needed }, chunks))
     }
 
-    /// Reads a part of the store.
-    fn part(&self, name: &str, span: Span, most: u64) -> Result<Option<Vec<u8>>, String> {
-        let data = self.parts.read(name, span, most).map_err(|what| format!("`{name}`: {what}"))?;
-        let [parts, bytes, unpacked] = self.counts.get();
-        if let Some(data) = &data {
-            self.counts.set([parts + 1, bytes + data.len() as u64, unpacked]);
+    /// Reads parts of the store and hands each on as it comes, in any order. Behind a network, several are on their way at once.
+    fn fetch(
+        &self,
+        wanted: &[(String, Span)],
+        most: u64,
+        mut each: impl FnMut(usize, Option<Vec<u8>>) -> Result<(), String>,
+    ) -> Result<(), String> {
+        let mut hand = |place: usize, read: Result<Option<Vec<u8>>, String>| {
+            let data = read.map_err(|what| format!("`{}`: {what}", wanted[place].0))?;
+            if let Some(data) = &data {
+                let [parts, bytes, unpacked] = self.counts.get();
+                self.counts.set([parts + 1, bytes + data.len() as u64, unpacked]);
+            }
+            each(place, data)
+        };
+        let room = (self.at_once / most.max(1)).clamp(1, self.parts.at_once() as u64) as usize;
+        let (parts, next) = (&*self.parts, AtomicUsize::new(0));
+        if room.min(wanted.len()) < 2 {
+            return wanted.iter().enumerate().try_for_each(|(place, (name, span))| hand(place, parts.read(name, *span, most)));
         }
-        Ok(data)
+        std::thread::scope(|scope| {
+            let (sender, receiver) = sync_channel(1);
+            for _ in 0..room.min(wanted.len()) {
+                let (sender, next) = (sender.clone(), &next);
+                let work = move || {
+                    loop {
+                        let place = next.fetch_add(1, Ordering::Relaxed);
+                        let Some((name, span)) = wanted.get(place) else { return };
+                        // The receiver is gone after an error.
+                        if sender.send((place, parts.read(name, *span, most))).is_err() {
+                            return;
+                        }
+                    }
+                };
+                let started = std::thread::Builder::new().name("ridgewatch-part".into()).spawn_scoped(scope, work);
+                started.map_err(|e| format!("no thread to read it: {e}"))?;
+            }
+            drop(sender);
+            receiver.into_iter().try_for_each(|(place, read)| hand(place, read))
+        })
     }
 
     fn unpack(&self, name: &str, steps: &[codecs::Step], data: Vec<u8>, bytes: u64) -> Result<Arc<Vec<u8>>, String> {
@@ -122,63 +186,95 @@ impl ZarrStore {
         unpack(steps, data, bytes).map(Arc::new).map_err(|what| format!("`{name}`: {what}"))
     }
 
-    /// The index of a shard: start and length of each inner chunk; `None` if the shard is not stored.
-    fn index(&self, variable: usize, codecs: &Shard, origin: &[usize], name: &str) -> Result<Option<Arc<Vec<u8>>>, String> {
-        let array = &self.arrays[variable].1;
-        let key = (variable, origin.to_vec(), true);
-        if let Some(held) = self.cache.borrow().get(&key) {
-            return Ok(held);
-        }
+    /// The indices of shards, by the place of the shard: start and length of each inner chunk.
+    fn indices(&self, variable: usize, codecs: &Shard, shards: BTreeSet<Vec<usize>>) -> Result<BTreeMap<Vec<usize>, Index>, String> {
+        let (folder, array) = &self.arrays[variable];
+        let key = |shard: &[usize]| (variable, shard.iter().zip(&array.chunk).map(|(k, extent)| k * extent).collect(), true);
+        let mut found = BTreeMap::new();
+        let (mut wanted, mut places) = (Vec::new(), Vec::new());
         let bytes = array.index_bytes();
         let sums = codecs.index_steps.iter().filter(|&&step| step == codecs::Step::Crc32c).count() as u64;
         let stored = bytes.saturating_add(4 * sums);
         let span = if codecs.index_first { Span::From(0, stored) } else { Span::Last(stored) };
-        let index = match self.part(name, span, most_stored(bytes))? {
-            Some(data) => {
-                Some(unpack(&codecs.index_steps, data, bytes).map(Arc::new).map_err(|what| format!("the index of `{name}`: {what}"))?)
-            }
-            None => None,
-        };
-        self.cache.borrow_mut().keep(key, &array.chunk, &index);
-        Ok(index)
-    }
-
-    /// What is unpacked at once, by its place among its like; `None` if it is not stored. It is kept if the request leaves some of it.
-    fn block(&self, variable: usize, codecs: &Codecs, place: &[usize], keep: bool) -> Result<Option<Arc<Vec<u8>>>, String> {
-        let (folder, array) = &self.arrays[variable];
-        let (block, rank) = (array.block(), array.rank);
-        let origin: Vec<usize> = (0..block.len()).map(|k| place[k] * block[k]).collect();
-        let key = (variable, origin.clone(), false);
-        if let Some(held) = self.cache.borrow().get(&key) {
-            return Ok(held);
-        }
-        let bytes = array.block_bytes();
-        let chunk: Vec<usize> = (0..block.len()).map(|k| origin[k] / array.chunk[k]).collect();
-        let name = within(folder, &array.names.of(&chunk[..rank]));
-        let data = match &codecs.shard {
-            None => self.part(&name, Span::All, most_stored(bytes))?,
-            Some(shard) => {
-                let first: Vec<usize> = (0..block.len()).map(|k| chunk[k] * array.chunk[k]).collect();
-                let Some(index) = self.index(variable, shard, &first, &name)? else { return Ok(None) };
-                let number = (0..block.len()).fold(0, |n, k| n * (array.chunk[k] / block[k]) + (origin[k] - first[k]) / block[k]);
-                let entry = |at: usize| {
-                    let bytes = index.get(at * 8..at * 8 + 8).and_then(|b| b.try_into().ok()).unwrap_or([0xff; 8]);
-                    if shard.index_big_endian { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) }
-                };
-                match (entry(2 * number), entry(2 * number + 1)) {
-                    (u64::MAX, u64::MAX) => None,
-                    (start, length) => self.part(&name, Span::From(start, length), most_stored(bytes))?,
+        for shard in shards {
+            match self.cache.borrow().get(&key(&shard)) {
+                Some(held) => {
+                    found.insert(shard, held);
+                }
+                None => {
+                    wanted.push((within(folder, &array.names.of(&shard[..array.rank])), span));
+                    places.push(shard);
                 }
             }
-        };
-        let data = match data {
-            Some(data) => Some(self.unpack(&name, &codecs.steps, data, bytes)?),
-            None => None,
-        };
-        if keep {
-            self.cache.borrow_mut().keep(key, block, &data);
         }
-        Ok(data)
+        self.fetch(&wanted, most_stored(bytes), |which, data| {
+            let unpacked = data.map(|data| unpack(&codecs.index_steps, data, bytes).map(Arc::new)).transpose();
+            let index = unpacked.map_err(|what| format!("the index of `{}`: {what}", wanted[which].0))?;
+            self.cache.borrow_mut().keep(key(&places[which]), &array.chunk, &index);
+            found.insert(places[which].clone(), index);
+            Ok(())
+        })?;
+        Ok(found)
+    }
+
+    /// What is unpacked at once, by its place among its like; what is not stored is left out. It is kept if the request leaves some of it.
+    fn blocks(
+        &self,
+        variable: usize,
+        codecs: &Codecs,
+        places: &[Vec<usize>],
+        keep: impl Fn(&[usize]) -> bool,
+        mut each: impl FnMut(&[usize], &[u8]),
+    ) -> Result<(), String> {
+        let (folder, array) = &self.arrays[variable];
+        let (block, bytes) = (array.block(), array.block_bytes());
+        let origin = |place: &[usize]| -> Vec<usize> { place.iter().zip(block).map(|(k, extent)| k * extent).collect() };
+        let chunk = |place: &[usize]| -> Vec<usize> { origin(place).iter().zip(&array.chunk).map(|(k, extent)| k / extent).collect() };
+        let mut missing = Vec::new();
+        for place in places {
+            let held = self.cache.borrow().get(&(variable, origin(place), false));
+            match held {
+                Some(held) => held.iter().for_each(|data| each(place, data)),
+                None => missing.push(place),
+            }
+        }
+        let name = |place: &[usize]| within(folder, &array.names.of(&chunk(place)[..array.rank]));
+        let (mut wanted, mut of) = (Vec::new(), Vec::new());
+        match &codecs.shard {
+            None => {
+                wanted.extend(missing.iter().map(|place| (name(place), Span::All)));
+                of = missing;
+            }
+            Some(shard) => {
+                let indices = self.indices(variable, shard, missing.iter().map(|place| chunk(place)).collect())?;
+                for place in missing {
+                    let (origin, chunk) = (origin(place), chunk(place));
+                    let Some(Some(index)) = indices.get(&chunk) else { continue };
+                    let inner = |k: usize| (origin[k] - chunk[k] * array.chunk[k]) / block[k];
+                    let number = (0..block.len()).fold(0, |n, k| n * (array.chunk[k] / block[k]) + inner(k));
+                    let entry = |at: usize| {
+                        let bytes = index.get(at * 8..at * 8 + 8).and_then(|b| b.try_into().ok()).unwrap_or([0xff; 8]);
+                        if shard.index_big_endian { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) }
+                    };
+                    match (entry(2 * number), entry(2 * number + 1)) {
+                        (u64::MAX, u64::MAX) => {}
+                        (start, length) => {
+                            wanted.push((name(place), Span::From(start, length)));
+                            of.push(place);
+                        }
+                    }
+                }
+            }
+        }
+        self.fetch(&wanted, most_stored(bytes), |which, data| {
+            let place = of[which];
+            let data = data.map(|data| self.unpack(&wanted[which].0, &codecs.steps, data, bytes)).transpose()?;
+            if keep(place) {
+                self.cache.borrow_mut().keep((variable, origin(place), false), block, &data);
+            }
+            data.iter().for_each(|data| each(place, data));
+            Ok(())
+        })
     }
 
     fn read_block(&self, variable: usize, start: &[usize], count: &[usize], out: &mut Vec<f64>) -> Result<(), String> {
@@ -196,20 +292,31 @@ impl ZarrStore {
         out.resize(count.iter().product(), array.fill);
         let strides = strides(block, &codecs.order);
         let rows = strides_of(count);
-        let mut number = vec![0; rank];
+        let stored = array.stored.bytes() as u64;
+        self.needed.set(count.iter().fold(stored, |n, &k| n.saturating_mul(k as u64)).saturating_add(self.needed.get()));
+        let low = |place: &[usize], k: usize| start[k].max(place[k] * block[k]);
+        let high = |place: &[usize], k: usize| ends[k].min((place[k] + 1).saturating_mul(block[k]));
+        let end = |place: &[usize], k: usize| array.shape[k].min((place[k] + 1).saturating_mul(block[k]));
+        let whole = |place: &[usize]| (0..rank).all(|k| low(place, k) == place[k] * block[k] && high(place, k) == end(place, k));
+        let remote = self.parts.at_once() > 1;
+        // A network is slower than memory: what the search for land or the choice of a grid has read serves again.
+        let keep = |place: &[usize]| remote || !whole(place);
+        let mut copy = |place: &[usize], data: &[u8]| {
+            let from = (0..rank).map(|k| (low(place, k) - place[k] * block[k]) * strides[k]).sum();
+            let to = (0..rank).map(|k| (low(place, k) - start[k]) * rows[k]).sum();
+            let extents: Vec<usize> = (0..rank).map(|k| high(place, k) - low(place, k)).collect();
+            let elements = Elements { data, number: array.stored, big_endian: codecs.big_endian };
+            elements.copy(from, &strides, &extents, &mut out[to..], &rows);
+        };
+        let (mut number, mut places) = (vec![0; rank], Vec::new());
         loop {
-            let place: Vec<usize> = (0..rank).map(|k| first[k] + number[k]).collect();
-            let low: Vec<usize> = (0..rank).map(|k| start[k].max(place[k] * block[k])).collect();
-            let high: Vec<usize> = (0..rank).map(|k| ends[k].min((place[k] + 1).saturating_mul(block[k]))).collect();
-            let whole = |k: usize| low[k] == place[k] * block[k] && high[k] == array.shape[k].min((place[k] + 1).saturating_mul(block[k]));
-            if let Some(data) = self.block(variable, codecs, &place, !(0..rank).all(whole))? {
-                let from = (0..rank).map(|k| (low[k] - place[k] * block[k]) * strides[k]).sum();
-                let to = (0..rank).map(|k| (low[k] - start[k]) * rows[k]).sum();
-                let extents: Vec<usize> = (0..rank).map(|k| high[k] - low[k]).collect();
-                let elements = Elements { data: &data, number: array.stored, big_endian: codecs.big_endian };
-                elements.copy(from, &strides, &extents, &mut out[to..], &rows);
+            places.push((0..rank).map(|k| first[k] + number[k]).collect());
+            let more = advance(&mut number, &blocks);
+            if !more || !remote || places.len() == BATCH {
+                self.blocks(variable, codecs, &places, keep, &mut copy)?;
+                places.clear();
             }
-            if !advance(&mut number, &blocks) {
+            if !more {
                 return Ok(());
             }
         }
@@ -288,6 +395,16 @@ impl Elements<'_> {
     }
 }
 
+/// Why a URL is not read.
+fn no_store(denied: bool) -> String {
+    let found = if denied {
+        "the server answers 403 (forbidden) where its metadata would be, as it does for what is not there, or for who may not read it"
+    } else {
+        "it holds no `zarr.json`, `.zmetadata`, `.zgroup` or `.zarray`"
+    };
+    format!("{found}; behind a URL, accepted are the folders of Zarr stores: files, zip files among them, have to be copied first")
+}
+
 /// Groups and arrays of a store.
 struct Nodes {
     version: u8,
@@ -320,7 +437,9 @@ impl Reader<'_> {
     /// Reads and parses a file of metadata.
     fn json(&mut self, name: &str) -> Result<Option<Value>, FormatFault> {
         let what = |what: String| FormatFault::Damaged(format!("`{name}`: {what}"));
-        let Some(bytes) = self.parts.read(name, Span::All, self.left).map_err(|e| FormatFault::Refused(format!("`{name}`: {e}")))? else {
+        // What a server does not answer may be intact.
+        let fault = if self.parts.lists() { FormatFault::Refused } else { FormatFault::Open };
+        let Some(bytes) = self.parts.read(name, Span::All, self.left).map_err(|e| fault(format!("`{name}`: {e}")))? else {
             return Ok(None);
         };
         self.left -= bytes.len() as u64;
@@ -359,8 +478,14 @@ impl Reader<'_> {
             return Ok((2, nodes.get(".zattrs").map(collect).unwrap_or_default()));
         }
         self.folders("", 0)?;
-        if self.arrays.is_empty() && self.json(".zgroup")?.is_none() {
-            return Err(FormatFault::Unknown("it holds no `zarr.json`, `.zmetadata`, `.zgroup` or `.zarray`".into()));
+        if self.arrays.is_empty() {
+            let group = self.json(".zgroup")?.is_some();
+            match (group, self.parts.lists()) {
+                (true, false) => self.parts.folders("").map(drop).map_err(FormatFault::Refused)?,
+                (true, true) => {}
+                (false, true) => return Err(FormatFault::Unknown("it holds no `zarr.json`, `.zmetadata`, `.zgroup` or `.zarray`".into())),
+                (false, false) => return Err(FormatFault::Refused(no_store(self.parts.denied()))),
+            }
         }
         let attributes = self.json(".zattrs")?;
         Ok((2, attributes.as_ref().map(collect).unwrap_or_default()))
@@ -380,11 +505,14 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// Metadata of version 2 of a folder and all within.
+    /// Metadata of version 2 of a folder and, if folders can be listed, of all within.
     fn folders(&mut self, folder: &str, depth: usize) -> Result<(), FormatFault> {
         if let Some(array) = self.json(&within(folder, ".zarray"))? {
             let attributes = self.json(&within(folder, ".zattrs"))?;
             return self.version_2(folder, &array, attributes.as_ref());
+        }
+        if !self.parts.lists() {
+            return Ok(());
         }
         for inner in self.listed(folder, depth)? {
             self.folders(&within(folder, &inner), depth + 1)?;
@@ -394,7 +522,8 @@ impl Reader<'_> {
 
     /// Folders in a folder, which are counted.
     fn listed(&mut self, folder: &str, depth: usize) -> Result<Vec<String>, FormatFault> {
-        let mut inner = self.parts.folders(folder).map_err(|what| FormatFault::Refused(format!("`{folder}`: {what}")))?;
+        let at = if folder.is_empty() { String::new() } else { format!("`{folder}`: ") };
+        let mut inner = self.parts.folders(folder).map_err(|what| FormatFault::Refused(format!("{at}{what}")))?;
         if depth > MAX_DEPTH && !inner.is_empty() {
             return Err(FormatFault::Refused(format!("its groups are nested more than {MAX_DEPTH} deep, or in a circle")));
         }

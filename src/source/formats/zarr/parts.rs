@@ -1,4 +1,4 @@
-//! Where the parts of a store lie: files of a folder, or entries of a zip file.
+//! Where the parts of a store lie: files of a folder, or entries of a zip file. Those behind a URL are in [`super::http`].
 
 use super::super::limits::{Limits, MAX_DEPTH, MAX_OBJECTS};
 use super::super::messages::FormatFault;
@@ -23,7 +23,7 @@ pub enum Span {
 
 impl Span {
     /// Start and number of bytes in a part of this length.
-    fn of(self, length: u64, most: u64) -> Result<(u64, u64), String> {
+    pub fn of(self, length: u64, most: u64) -> Result<(u64, u64), String> {
         let (start, bytes) = match self {
             Self::All => (0, length),
             Self::Last(bytes) => (length.saturating_sub(bytes), bytes),
@@ -40,7 +40,7 @@ impl Span {
 }
 
 /// A store, as named parts. Names are paths within it, with `/`.
-pub trait Parts: Send {
+pub trait Parts: Send + Sync {
     /// Bytes of a part, `most` of them at most; `None` if there is no such part.
     ///
     /// # Errors
@@ -52,10 +52,30 @@ pub trait Parts: Send {
     /// # Errors
     /// They cannot be listed, or are too many.
     fn folders(&self, name: &str) -> Result<Vec<String>, String>;
+
+    /// Whether folders can be listed.
+    fn lists(&self) -> bool {
+        true
+    }
+
+    /// How many parts are worth being asked for at once.
+    fn at_once(&self) -> usize {
+        1
+    }
+
+    /// Whether metadata may be there, but not for this reader.
+    fn denied(&self) -> bool {
+        false
+    }
+
+    /// Requests to a server so far.
+    fn requests(&self) -> u64 {
+        0
+    }
 }
 
 /// Refuses names that lead out of a store.
-fn checked(name: &str) -> Result<(), String> {
+pub fn checked(name: &str) -> Result<(), String> {
     let odd = |part: &str| part.is_empty() || part == "." || part == ".." || part.contains(['\\', '\0']);
     if name.split('/').any(odd) { Err("names of parts hold no `..` and no empty pieces".into()) } else { Ok(()) }
 }
