@@ -89,6 +89,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text)));
         }
         Event::Note(text) => bar.suspend(|| messages::note(text)),
+        Event::Slide(_) => {}
         Event::Progress(share) => bar.set_position(100 * whole + (share * 100.0) as u64),
         Event::Frame(frame) => {
             whole += 1;

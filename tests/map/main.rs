@@ -9,4 +9,5 @@ mod kit;
 mod pixels;
 mod projections;
 mod ridges;
+mod slides;
 mod surfaces;
