@@ -162,13 +162,18 @@ impl MovieStatistics {
 }
 
 impl FileStatistics {
+    /// Whether maps are lost, and all pictures and records are written.
+    pub fn lost_only_maps(&self) -> bool {
+        self.maps_failed > 0 && self.pictures_failed + self.unfinished + self.records_lost == 0
+    }
+
     /// Describes records, pictures and maps lost. `None` if everything is written, apart from what settings drop.
     pub fn lost(&self) -> Option<String> {
         let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, maps_failed, .. } = *self;
         let lost = pictures_failed + unfinished;
         let why = self.refused.as_deref().unwrap_or("the disk does not answer");
         match (lost, records_lost) {
-            (0, 0) if maps_failed > 0 => Some(format!("{maps_failed} maps are lost ({why})")),
+            (0, 0) if self.lost_only_maps() => Some(format!("{maps_failed} maps are lost ({why})")),
             (0, 0) => None,
             (0, records) => Some(format!("{records} records are lost ({why})")),
             (failed, _) => Some(format!(
