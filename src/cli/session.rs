@@ -8,7 +8,7 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::map::SlideMaps;
+use ridgewatch::map::{SlideMaps, annotated};
 use ridgewatch::publish::{
     DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
     WhenDiskSlow,
@@ -54,8 +54,9 @@ pub struct RunArguments {
     /// Frames a second of the film, from 1 to 50.
     #[arg(long, value_name = "N", default_value_t = 10.0, requires = "movie")]
     movie_fps: f64,
-    /// Write time and stated error into the film.
-    #[arg(long, requires = "movie")]
+    /// Draw a strip below the PNGs of the frames: colour bar, time, source, stated error. Films get time and error in a corner instead. Published
+    /// frames and EXR stay as they are.
+    #[arg(long)]
     annotate: bool,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
@@ -169,6 +170,9 @@ impl Session<'_> {
             folder.give_up();
             return Err(error.into());
         }
+        if options.annotate {
+            folder.draw_by(|frame| annotated(frame).map_err(std::io::Error::other));
+        }
         output.write_to(folder, &publish)?;
         movie.into_iter().for_each(|movie| output.film(movie));
         if let Some(endpoint) = output.endpoint() {
@@ -209,7 +213,8 @@ impl Session<'_> {
             print_report(&report, last.as_deref());
         }
         if let Some(lost) = summary.files.as_ref().and_then(FileStatistics::lost) {
-            bail!("{}: {lost}", out.join("frames").display());
+            let only_maps = summary.files.as_ref().is_some_and(|files| files.lost_only_maps());
+            bail!("{}: {lost}", out.join(if only_maps { "maps" } else { "frames" }).display());
         }
         if !common.json {
             print_text(format_args!("frames in {}", out.join("frames").display()));

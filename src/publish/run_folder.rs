@@ -38,6 +38,14 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// Attempts to create the first vacant folder. Each fails because another run takes it at that moment.
 const VACANT_ATTEMPTS: usize = 100;
 
+/// Encodes the PNG of a frame.
+pub type DrawFrame = fn(&Frame) -> io::Result<Vec<u8>>;
+
+/// The picture alone.
+fn plain(frame: &Frame) -> io::Result<Vec<u8>> {
+    png(&frame.film, frame.tone_map).map_err(io::Error::other)
+}
+
 /// A folder that only this run writes to. It is held open, so that its files are written into the folder that was checked.
 #[derive(Debug)]
 pub struct RunFolder {
@@ -53,6 +61,7 @@ pub struct RunFolder {
     /// Pictures in the folder, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
+    draw: DrawFrame,
     /// `None` before the first map.
     maps: Option<Folder>,
     /// Maps in the folder, oldest first.
@@ -220,6 +229,7 @@ impl RunFolder {
             records_removed: 0,
             kept: VecDeque::new(),
             kept_bytes: 0,
+            draw: plain,
             maps: None,
             kept_maps: VecDeque::new(),
             previous,
@@ -241,6 +251,11 @@ impl RunFolder {
             tracing::warn!("{}: the previous run cannot be restored: {error}", self.path().display());
             false
         })
+    }
+
+    /// Draws the PNGs of frames by another function than the picture alone.
+    pub fn draw_by(&mut self, draw: DrawFrame) {
+        self.draw = draw;
     }
 
     /// The folder.
@@ -324,7 +339,7 @@ impl RunFolder {
                 self.write_picture(&mut new, &format!("{name}.exr"), &bytes)?;
             }
             if settings.preview {
-                let bytes = png(&frame.film, frame.tone_map).map_err(io::Error::other)?;
+                let bytes = (self.draw)(frame)?;
                 self.write_picture(&mut new, &format!("{name}.png"), &bytes)?;
             }
             Ok(())
