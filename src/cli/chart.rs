@@ -56,7 +56,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let device = device(common, &scene)?;
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
-    let bar = messages::spinner("opening the source".into());
+    let bar = messages::spinner_within("opening the source".into(), options.seconds);
     let tell = |what: &str| {
         tracing::info!("measuring {what}");
         bar.set_message(format!("measuring {what}"));

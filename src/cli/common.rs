@@ -3,7 +3,7 @@
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, DeviceChoice};
-use ridgewatch::chart::{Choice, choose, device_name};
+use ridgewatch::chart::{Choice, TRIAL_SECONDS, choose, device_name};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
@@ -127,7 +127,8 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
     let choice = match earlier.filter(|earlier: &Remembered| earlier.asked == asked) {
         Some(Remembered { choice, .. }) => choice,
         None => {
-            let _spinner = messages::spinner("trying methods on the first slide".into());
+            let _spinner =
+                messages::spinner(format!("trying methods on the first slide: {TRIAL_SECONDS} s of frames, and their preparation"));
             let choice = choose(&scene.settings(), device, common.threads, &AtomicBool::new(false))
                 .map_err(|error| located(scene, error, RunError::refused))?;
             if let Some(file) = &remembered {

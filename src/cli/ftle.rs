@@ -161,9 +161,16 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         bail!(few(last, there));
     }
     let device = device(common, &scene)?;
+    let last = wanted.last.or_else(|| slides.expected().map(|there| there.saturating_sub(1)));
+    let bar = match last.map(|last| (last + 1).saturating_sub(wanted.first)) {
+        // With the time left, from that of the slides so far.
+        Some(count) if count > 1 => messages::progress(Some(count)).with_finish(indicatif::ProgressFinish::AndClear),
+        _ => messages::spinner(String::new()),
+    };
     let mut export = None;
     let mut reports = Vec::new();
     for index in 0..=wanted.last.unwrap_or(u64::MAX - 1) {
+        bar.set_message("reading the window");
         let Some(slide) = slides.next_slide(&AtomicBool::new(false)).map_err(faulty)? else {
             if wanted.last.is_some() || reports.is_empty() {
                 bail!(few(wanted.last.unwrap_or(wanted.first), index));
@@ -173,7 +180,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         if index < wanted.first {
             continue;
         }
-        let report = compute(&plan, &slide, options, &device, &mut export).map_err(|error| match error.downcast::<RunError>() {
+        let report = compute(&plan, &slide, options, &device, &bar, &mut export).map_err(|error| match error.downcast::<RunError>() {
             Ok(error) => located(&scene, error, RunError::refused),
             Err(error) => match error.downcast::<FlowError>() {
                 Ok(error) => located(&scene, error, FlowError::refused),
@@ -181,10 +188,12 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
             },
         })?;
         if !common.json {
-            print_report(&report);
+            bar.suspend(|| print_report(&report));
         }
         reports.push(report);
+        bar.inc(1);
     }
+    bar.finish_and_clear();
     let file = export.map(FieldExport::finish).transpose()?;
     match (&file, common.json, options.slides) {
         (Some(file), false, _) => print_text(format_args!("written to {}", file.display())),
@@ -202,7 +211,14 @@ fn history() -> String {
 }
 
 /// Computes one field and, with `--out`, adds it to the file, which the first one begins.
-fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device, export: &mut Option<FieldExport>) -> Result<Report> {
+fn compute(
+    plan: &Plan,
+    slide: &Slide,
+    options: &Options,
+    device: &Device,
+    bar: &indicatif::ProgressBar,
+    export: &mut Option<FieldExport>,
+) -> Result<Report> {
     let mut grid = options.grid;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}
@@ -224,22 +240,21 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device, expor
         bail!(Usage(format!("--grid {x}x{y}x{z}: accepted: at most 2^27 seeds in all")));
     }
     let seeds = seeds(&plan.domain, grid);
-    let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
+    bar.set_message(format!("tracing {} seeds", seeds.len()));
     let TracedOnce { flow: tracer, traced, seconds, note } =
         device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(RunError::of)?;
-    note.into_iter().for_each(messages::note);
+    note.into_iter().for_each(|note| bar.suspend(|| messages::note(note)));
     let tau = tracer.tau();
     let without: Vec<bool> = seeds.iter().map(|seed| tracer.is_missing(*seed)).collect();
     let ftle: Vec<f64> = unrounded(&traced).iter().zip(&without).map(|(s, &missing)| if missing { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
     let missing = without.iter().filter(|missing| **missing).count();
     if options.check || options.convergence {
-        spinner.set_message(format!("integrating {} seeds for comparison", seeds.len()));
+        bar.set_message(format!("integrating {} seeds for comparison", seeds.len()));
     }
     let truth = if options.check { Some(truth(plan, slide, &seeds)?) } else { None };
     let check = truth.as_ref().map(|truth| check(truth, &*tracer, &seeds, &ftle)).transpose()?;
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
-    spinner.finish_and_clear();
     if let Some(out) = &options.out {
         let export = match export {
             Some(export) => export,

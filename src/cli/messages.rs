@@ -1,6 +1,6 @@
 //! Messages on standard error.
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressState, ProgressStyle};
 use std::io::{IsTerminal, Write, stderr};
 use tracing_subscriber::EnvFilter;
 
@@ -75,5 +75,18 @@ pub fn spinner(text: String) -> ProgressBar {
     let bar = progress(None).with_finish(ProgressFinish::AndClear);
     bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
     bar.set_message(text);
+    bar
+}
+
+/// A spinner that also shows the time left of work that ends after `seconds`.
+pub fn spinner_within(text: String, seconds: f64) -> ProgressBar {
+    let bar = spinner(text);
+    let left = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        // A text that is not written is not shown.
+        let _ = write!(out, "at most {:.0} s left", (seconds - state.elapsed().as_secs_f64()).max(0.0));
+    };
+    if let Ok(style) = ProgressStyle::with_template("{spinner} {elapsed_precise} {left} {msg}") {
+        bar.set_style(style.with_key("left", left));
+    }
     bar
 }

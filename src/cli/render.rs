@@ -6,6 +6,8 @@ use super::common::{
 };
 use super::{messages, session};
 use anyhow::{Context, Result, bail};
+use ridgewatch::files::write_whole;
+use ridgewatch::map::annotated;
 use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
 use ridgewatch::render::{Method, Target};
 use ridgewatch::run::{self, Event, Frame, RunError, RunOptions};
@@ -40,6 +42,9 @@ pub struct Options {
     /// Start from a surrogate written by `replay --checkpoint`.
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
+    /// Draw a strip below the PNG: colour bar, time, source, stated error. The EXR stays as it is.
+    #[arg(long)]
+    annotate: bool,
     /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it, and both a .scene.toml,
     /// from which `render` makes the picture again.
     #[arg(long, short, default_value = "out/render.exr")]
@@ -89,6 +94,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text)));
         }
         Event::Note(text) => bar.suspend(|| messages::note(text)),
+        Event::Slide(_) => {}
         Event::Progress(share) => bar.set_position(100 * whole + (share * 100.0) as u64),
         Event::Frame(frame) => {
             whole += 1;
@@ -103,7 +109,12 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     if extension == "exr" {
         write_exr(&options.out, &frame.film, Some(&*frame.record))?;
     }
-    write_png(&options.out.with_extension("png"), &frame.film, frame.tone_map)?;
+    let png = options.out.with_extension("png");
+    if options.annotate {
+        write_whole(&png, &annotated(&frame)?).with_context(|| format!("cannot write {}", png.display()))?;
+    } else {
+        write_png(&png, &frame.film, frame.tone_map)?;
+    }
     write_scene(&scene_file, "render", &scene_text)?;
     if common.json {
         return print_json(&*frame.record);

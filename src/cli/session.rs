@@ -8,6 +8,7 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
+use ridgewatch::map::{SlideMaps, annotated};
 use ridgewatch::publish::{
     DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
     WhenDiskSlow,
@@ -17,7 +18,7 @@ use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport,
 use ridgewatch::steer::{CommandSocket, SteerError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 /// Options that `replay` and `attach` share.
@@ -53,8 +54,9 @@ pub struct RunArguments {
     /// Frames a second of the film, from 1 to 50.
     #[arg(long, value_name = "N", default_value_t = 10.0, requires = "movie")]
     movie_fps: f64,
-    /// Write time and stated error into the film.
-    #[arg(long, requires = "movie")]
+    /// Draw a strip below the PNGs of the frames: colour bar, time, source, stated error. Films get time and error in a corner instead. Published
+    /// frames and EXR stay as they are.
+    #[arg(long)]
     annotate: bool,
     /// Check each frame's stated error afterwards on N new points, and record the result.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
@@ -168,6 +170,9 @@ impl Session<'_> {
             folder.give_up();
             return Err(error.into());
         }
+        if options.annotate {
+            folder.draw_by(|frame| annotated(frame).map_err(std::io::Error::other));
+        }
         output.write_to(folder, &publish)?;
         movie.into_iter().for_each(|movie| output.film(movie));
         if let Some(endpoint) = output.endpoint() {
@@ -196,7 +201,8 @@ impl Session<'_> {
             steering,
             abandon: stop.abandoned.clone(),
         };
-        let (result, last, summary) = work(setup, &scene, &run_options, output, &stop.requested);
+        let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| !follows && publish.maps);
+        let (result, last, summary) = work(setup, &scene, &run_options, output, maps, &stop.requested);
         let report = result?;
         for warning in &report.warnings {
             messages::note(format_args!("after the last frame: {warning}"));
@@ -207,10 +213,14 @@ impl Session<'_> {
             print_report(&report, last.as_deref());
         }
         if let Some(lost) = summary.files.as_ref().and_then(FileStatistics::lost) {
-            bail!("{}: {lost}", out.join("frames").display());
+            let only_maps = summary.files.as_ref().is_some_and(|files| files.lost_only_maps());
+            bail!("{}: {lost}", out.join(if only_maps { "maps" } else { "frames" }).display());
         }
         if !common.json {
             print_text(format_args!("frames in {}", out.join("frames").display()));
+            if summary.files.as_ref().is_some_and(|files| files.maps_written > 0) {
+                print_text(format_args!("a map of each slide in {}", out.join("maps").display()));
+            }
             summary.movie.iter().for_each(|movie| print_text(movie.line()));
         }
         const DONE: &str = "the run folder is complete up to the last finished frame";
@@ -283,12 +293,32 @@ fn work(
     scene: &SceneFile,
     options: &RunOptions,
     mut output: Output,
+    mut maps: Option<SlideMaps>,
     stop: &AtomicBool,
 ) -> (Result<RunReport>, Option<Arc<FrameRecord>>, Summary) {
     let (source, time_unit) = (setup.plan.source.clone(), setup.plan.time_unit.clone());
     let mut bar = messages::progress(None);
     let mut last: Option<Arc<FrameRecord>> = None;
-    let run = || run::run(setup, options, &mut |event| show(event, &mut bar, &mut last, &mut output), stop);
+    let mut sink = |event| match event {
+        Event::Slide(shown) => {
+            // A signal ends the run soon.
+            if let Some(drawing) = maps.as_mut().filter(|_| !stop.load(Ordering::Relaxed)) {
+                bar.set_message(format!("map of slide {}", shown.slide.index));
+                match drawing.draw(shown) {
+                    Ok((map, notes)) => {
+                        notes.iter().for_each(|text| bar.suspend(|| messages::note(text)));
+                        output.map(map);
+                    }
+                    Err(error) => {
+                        bar.suspend(|| messages::note(format_args!("no maps from here on: {error}; the frames go on")));
+                        maps = None;
+                    }
+                }
+            }
+        }
+        event => show(event, &mut bar, &mut last, &mut output),
+    };
+    let run = || run::run(setup, options, &mut sink, stop);
     // A panic must not cost the frames already made.
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
     let result = result.and_then(|result| result.map_err(|error| located(scene, error, RunError::refused)));
@@ -334,6 +364,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
             bar.suspend(|| messages::note(text));
             notify::running(|| "preparing the first frame".into());
         }
+        Event::Slide(_) => {}
         Event::Progress(share) => {
             bar.set_message(format!("frame {:3.0} %", share * 100.0));
             notify::running(|| match last {

@@ -34,21 +34,7 @@ impl FramePage {
     /// # Errors
     /// plotters fails.
     pub fn new(picture: Picture, record: &FrameRecord, colours: &ColorBar, title: &str, width: usize) -> Result<Self, DrawError> {
-        let direction = if record.direction == Direction::Forward.name() { Direction::Forward } else { Direction::Backward };
-        let rate = Rate::fitting(&record.time_unit, record.tau);
-        let unit = if rate.unit.is_empty() { String::new() } else { format!(", {}", rate.unit) };
-        let what = format!("{} FTLE ({} structures)", direction.name(), structures(direction));
-        let bar = Bar {
-            label: format!("{what}{unit}"),
-            colours: (0..PARTS).map(|part| between(&colours.colors, (part as f64 + 0.5) / PARTS as f64)).collect(),
-            range: [colours.low, colours.high].map(|value| value * rate.factor),
-            goes_on: [true, true],
-        };
-        let when = match &record.date {
-            Some(text) => date(text),
-            // Without the digits that sums of steps leave.
-            None => format!("t = {} {}", (record.time * 1e6).round() / 1e6, record.time_unit).trim_end().to_owned(),
-        };
+        let (bar, what, when) = (bar_of(record, colours, false), field_of(record), when_of(record));
         let unit = (width as f64 / 900.0).clamp(0.6, 5.0);
         let words = wrapped(&words(record), 13.0 * unit, width as f64 - 32.0 * unit)?;
         let [columns, rows] = picture.size.map(|n| n.max(1) as f64);
@@ -60,7 +46,12 @@ impl FramePage {
         Ok(Self {
             picture,
             title: if title.is_empty() { what } else { title.to_owned() },
-            subtitle: format!("{when}, tau = {} {}, frame {}", duration(record.tau, &record.time_unit), direction.name(), record.frame),
+            subtitle: format!(
+                "{when}, tau = {} {}, frame {}",
+                duration(record.tau, &record.time_unit),
+                direction_of(record).name(),
+                record.frame
+            ),
             bar,
             words,
             size: [width as f64, height.ceil()],
@@ -126,6 +117,39 @@ impl Sheet for FramePage {
     }
 }
 
+fn direction_of(record: &FrameRecord) -> Direction {
+    if record.direction == Direction::Forward.name() { Direction::Forward } else { Direction::Backward }
+}
+
+/// What a frame shows.
+fn field_of(record: &FrameRecord) -> String {
+    let direction = direction_of(record);
+    format!("{} FTLE ({} structures)", direction.name(), structures(direction))
+}
+
+/// The colour bar of a frame. Its label tells the ends too if `ends` is set, since ticks stand at round numbers.
+pub(super) fn bar_of(record: &FrameRecord, colours: &ColorBar, ends: bool) -> Bar {
+    let rate = Rate::fitting(&record.time_unit, record.tau);
+    let range = [colours.low, colours.high].map(|value| value * rate.factor);
+    let unit = if rate.unit.is_empty() { String::new() } else { format!(", {}", rate.unit) };
+    let ends = if ends { format!(", {} to {}", number(range[0]), rate.words(range[1])) } else { unit };
+    Bar {
+        label: format!("{}{ends}", field_of(record)),
+        colours: (0..PARTS).map(|part| between(&colours.colors, (part as f64 + 0.5) / PARTS as f64)).collect(),
+        range,
+        goes_on: [true, true],
+    }
+}
+
+/// Date or time of a frame.
+pub(super) fn when_of(record: &FrameRecord) -> String {
+    match &record.date {
+        Some(text) => date(text),
+        // Without the digits that sums of steps leave.
+        None => format!("t = {} {}", (record.time * 1e6).round() / 1e6, record.time_unit).trim_end().to_owned(),
+    }
+}
+
 /// A colour between neighbours of a list that lies evenly on [0, 1].
 fn between(colours: &[[u8; 3]], share: f64) -> [u8; 3] {
     let at = share.clamp(0.0, 1.0) * colours.len().saturating_sub(1) as f64;
@@ -157,7 +181,7 @@ fn words(record: &FrameRecord) -> Vec<String> {
 }
 
 /// The stated error of the picture, with its interval.
-fn picture_error(record: &FrameRecord) -> String {
+pub(super) fn picture_error(record: &FrameRecord) -> String {
     if let Some(error) = &record.picture_error {
         // The peak of the picture is 1.
         let share = |decibels: f64| number(100.0 * 10f64.powf(-decibels / 20.0));

@@ -1,7 +1,7 @@
 //! Thread that writes the run folder, with a short queue.
 
 use super::error::PublishError;
-use super::run_folder::RunFolder;
+use super::run_folder::{RunFolder, SlideMap};
 use super::settings::{ExrFrames, PublishSettings, WhenDiskSlow};
 use super::summary::FileStatistics;
 use crate::run::{Frame, FrameRecord};
@@ -58,6 +58,7 @@ enum Job {
     Whole(Frame),
     /// Its pictures were dropped.
     Record(Arc<FrameRecord>),
+    Map(SlideMap),
 }
 
 impl Shared {
@@ -109,6 +110,17 @@ impl FileWriter {
         }
         state.queue.push_back(Job::Whole(frame));
         state.pictures += 1;
+        self.shared.changed.notify_all();
+    }
+
+    /// Queues the map of a slide, whose frame was queued before. One that finds the queue full is dropped as a record is.
+    pub(super) fn map(&self, map: SlideMap) {
+        let mut state = self.shared.lock();
+        if state.queue.len() >= MAX_RECORDS {
+            state.statistics.maps_failed += 1;
+            return;
+        }
+        state.queue.push_back(Job::Map(map));
         self.shared.changed.notify_all();
     }
 
@@ -183,6 +195,23 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
         let record = match &job {
             Job::Whole(frame) => &frame.record,
             Job::Record(record) => record,
+            Job::Map(map) => {
+                let written = folder.write_map(map, settings);
+                let statistics = &mut shared.lock().statistics;
+                statistics.maps_written += u64::from(written.is_ok());
+                statistics.maps_failed += u64::from(written.is_err());
+                if let Err(error) = written {
+                    let path = folder.path().display();
+                    if statistics.maps_failed == 1 {
+                        tracing::warn!(
+                            "{path}: the map of slide {} could not be written: {error}; the run continues and counts such maps",
+                            map.slide
+                        );
+                    }
+                    statistics.refused.get_or_insert_with(|| error.to_string());
+                }
+                continue;
+            }
         };
         let appended = folder.append_record(record, settings.records_bytes);
         let pictured = match &job {

@@ -36,7 +36,7 @@ pub use output::Output;
 pub use past_run::{PastRun, Picture};
 pub use plane::{Layer, PlaneHead, no_error, plane};
 pub use preview::{jpeg, png, raw, write_png};
-pub use run_folder::{RunFolder, Written};
+pub use run_folder::{DrawFrame, RunFolder, SlideMap, Written};
 pub use scene::{refuse_foreign_scene, write_scene};
 pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, Peers, PublishSettings, WhenDiskSlow};
 pub use summary::{FileStatistics, MovieStatistics, PublishStatistics, Summary, Totals, peak_memory_bytes};

@@ -4,7 +4,7 @@ use super::error::PublishError;
 use super::file_writer::FileWriter;
 use super::movie::Movie;
 use super::newest::NewestFrame;
-use super::run_folder::RunFolder;
+use super::run_folder::{RunFolder, SlideMap};
 use super::settings::PublishSettings;
 use super::summary::{Summary, Totals, peak_memory_bytes};
 use super::zmq::Publisher;
@@ -81,6 +81,13 @@ impl Output {
         }
         if let Some(files) = &self.files {
             files.frame(frame);
+        }
+    }
+
+    /// Takes the map of a slide, for the run folder; never fails.
+    pub fn map(&mut self, map: SlideMap) {
+        if let Some(files) = &self.files {
+            files.map(map);
         }
     }
 

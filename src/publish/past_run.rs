@@ -21,6 +21,11 @@ pub struct PastRun {
     kept: BTreeMap<u64, PathBuf>,
 }
 
+impl Picture {
+    /// Least width of a picture with a strip below (`--annotate`), so that words have room.
+    pub const LEAST_WIDTH: usize = 320;
+}
+
 /// A picture of 8 bits, rows from the top.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
@@ -129,9 +134,15 @@ impl PastRun {
         let mut reader = ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
         // Before the picture is allocated.
         let mut limits = Limits::default();
-        (limits.max_image_width, limits.max_image_height) = (u32::try_from(width).ok(), u32::try_from(height).ok());
+        // With room for a strip.
+        let most = [width.max(Picture::LEAST_WIDTH), height.saturating_add(width).saturating_add(1024)].map(|n| u32::try_from(n).ok());
+        [limits.max_image_width, limits.max_image_height] = most;
         reader.limits(limits);
-        let picture = reader.decode().map_err(|error| unreadable(&error))?.into_rgb8();
+        let mut picture = reader.decode().map_err(|error| unreadable(&error))?.into_rgb8();
+        if picture.width() as usize == width.max(Picture::LEAST_WIDTH) && picture.height() as usize > height {
+            // The frame above the strip.
+            picture = image::imageops::crop_imm(&picture, 0, 0, width as u32, height as u32).to_image();
+        }
         let size = [picture.width() as usize, picture.height() as usize];
         if size != record.size {
             return Err(another(size));

@@ -1,4 +1,4 @@
-//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `records.jsonl` (and `records-1.jsonl`), `summary.json`.
+//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `maps/slide_000000.png` and `.json`, `records.jsonl` (and `records-1.jsonl`), `summary.json`.
 
 use super::error::PublishError;
 use super::exr::encode_exr;
@@ -18,6 +18,8 @@ use std::time::Duration;
 
 /// Folder of the pictures.
 pub(super) const FRAMES: &str = "frames";
+/// Folder of the maps, made for the first one.
+const MAPS: &str = "maps";
 /// Records, one JSON object a line.
 pub(super) const RECORDS: &str = "records.jsonl";
 /// Older records, if their size is capped.
@@ -36,6 +38,14 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// Attempts to create the first vacant folder. Each fails because another run takes it at that moment.
 const VACANT_ATTEMPTS: usize = 100;
 
+/// Encodes the PNG of a frame.
+pub type DrawFrame = fn(&Frame) -> io::Result<Vec<u8>>;
+
+/// The picture alone.
+fn plain(frame: &Frame) -> io::Result<Vec<u8>> {
+    png(&frame.film, frame.tone_map).map_err(io::Error::other)
+}
+
 /// A folder that only this run writes to. It is held open, so that its files are written into the folder that was checked.
 #[derive(Debug)]
 pub struct RunFolder {
@@ -51,6 +61,11 @@ pub struct RunFolder {
     /// Pictures in the folder, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
+    draw: DrawFrame,
+    /// `None` before the first map.
+    maps: Option<Folder>,
+    /// Maps in the folder, oldest first.
+    kept_maps: VecDeque<Kept>,
     /// Folder with the files of the previous run, until this one has a frame.
     previous: Option<Folder>,
     _lock: Lock,
@@ -67,6 +82,17 @@ impl Kept {
     fn bytes(&self) -> u64 {
         self.files.iter().map(|(_, bytes)| bytes).sum()
     }
+}
+
+/// The map of a slide.
+#[derive(Debug)]
+pub struct SlideMap {
+    /// Number of the slide.
+    pub slide: u64,
+    /// The picture.
+    pub png: Vec<u8>,
+    /// Its record, as JSON.
+    pub record: Vec<u8>,
 }
 
 /// Result of writing a frame's pictures.
@@ -169,8 +195,14 @@ impl RunFolder {
             remove_previous(&folder).map_err(aside)?;
         }
         let previous = if empty { folder.existing(PREVIOUS) } else { folder.inner(PREVIOUS).map(Some) }.map_err(aside)?;
+        // Opened if there is one to move.
+        let maps = folder.existing(MAPS).map_err(|error| refuse(&path.join(MAPS), error))?;
         for old in &old {
-            let from = if old.is_picture { &frames } else { &folder };
+            let from = match (old.place, &maps) {
+                (Place::Frames, _) => &frames,
+                (Place::Maps, Some(maps)) => maps,
+                _ => &folder,
+            };
             let moved = match &previous {
                 Some(previous) if !empty => from.rename(&old.name, previous, &old.name),
                 _ => from.remove(&old.name),
@@ -197,6 +229,9 @@ impl RunFolder {
             records_removed: 0,
             kept: VecDeque::new(),
             kept_bytes: 0,
+            draw: plain,
+            maps: None,
+            kept_maps: VecDeque::new(),
             previous,
             _lock: lock,
         })
@@ -216,6 +251,11 @@ impl RunFolder {
             tracing::warn!("{}: the previous run cannot be restored: {error}", self.path().display());
             false
         })
+    }
+
+    /// Draws the PNGs of frames by another function than the picture alone.
+    pub fn draw_by(&mut self, draw: DrawFrame) {
+        self.draw = draw;
     }
 
     /// The folder.
@@ -299,7 +339,7 @@ impl RunFolder {
                 self.write_picture(&mut new, &format!("{name}.exr"), &bytes)?;
             }
             if settings.preview {
-                let bytes = png(&frame.film, frame.tone_map).map_err(io::Error::other)?;
+                let bytes = (self.draw)(frame)?;
                 self.write_picture(&mut new, &format!("{name}.png"), &bytes)?;
             }
             Ok(())
@@ -313,6 +353,45 @@ impl RunFolder {
         self.kept_bytes += bytes;
         self.kept.push_back(new);
         Ok(Written { bytes, removed: self.make_room(settings), replaced })
+    }
+
+    /// Writes the map of a slide. With `keep` no more maps stay than frames may.
+    ///
+    /// # Errors
+    /// Errors of the system. Then no file of the map remains.
+    pub fn write_map(&mut self, map: &SlideMap, settings: &PublishSettings) -> io::Result<()> {
+        let maps = match self.maps.take() {
+            Some(maps) => maps,
+            None => {
+                let maps = self.folder.inner(MAPS)?;
+                maps.check_owner()?;
+                maps
+            }
+        };
+        let maps = self.maps.insert(maps);
+        let name = format!("slide_{:06}", map.slide);
+        let mut new = Kept { slide: map.slide, files: Vec::new() };
+        for (extension, bytes) in [("png", &map.png), ("json", &map.record)] {
+            let file = format!("{name}.{extension}");
+            if let Err(error) = maps.write_whole(&file, bytes) {
+                remove(maps, &new.files);
+                return Err(error);
+            }
+            new.files.push((file, bytes.len() as u64));
+        }
+        self.kept_bytes += new.bytes();
+        self.kept_maps.push_back(new);
+        while self.kept_maps.len() > settings.keep.unwrap_or(usize::MAX) {
+            self.remove_oldest_map();
+        }
+        Ok(())
+    }
+
+    fn remove_oldest_map(&mut self) {
+        if let (Some(oldest), Some(maps)) = (self.kept_maps.pop_front(), &self.maps) {
+            remove(maps, &oldest.files);
+            self.kept_bytes -= oldest.bytes();
+        }
     }
 
     /// Deletes the EXR of the newest frame in the folder if it belongs to this slide. Its preview remains.
@@ -344,6 +423,11 @@ impl RunFolder {
             self.remove(&oldest.files);
             self.kept_bytes -= oldest.bytes();
             removed += 1;
+            // Maps of slides whose frames are gone.
+            let first = self.kept.front().map_or(0, |kept| kept.slide);
+            while self.kept_maps.front().is_some_and(|map| map.slide < first) {
+                self.remove_oldest_map();
+            }
         }
         removed
     }
@@ -374,15 +458,19 @@ impl RunFolder {
         written.map_err(|source| PublishError::Folder { path: self.path().join(SUMMARY), source })
     }
 
-    /// Deletes pictures. Files that do not exist any more are ignored; other errors are warnings.
     fn remove(&self, files: &[(String, u64)]) {
-        for (file, _) in files {
-            match self.frames.remove(file) {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                    tracing::warn!("{}: cannot be removed: {error}", self.frames.path().join(file).display());
-                }
-                _ => {}
+        remove(&self.frames, files);
+    }
+}
+
+/// Deletes pictures. Files that do not exist any more are ignored; other errors are warnings.
+fn remove(folder: &Folder, files: &[(String, u64)]) {
+    for (file, _) in files {
+        match folder.remove(file) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                tracing::warn!("{}: cannot be removed: {error}", folder.path().join(file).display());
             }
+            _ => {}
         }
     }
 }
@@ -425,8 +513,11 @@ fn restore(folder: &Folder, frames: &Folder, previous: &Folder) -> io::Result<()
         return Err(error);
     }
     for name in previous.names()? {
-        let to = if name.to_str().is_some_and(is_picture) { frames } else { folder };
-        previous.rename(&name, to, &name)?;
+        match name.to_str() {
+            Some(known) if is_picture(known) => previous.rename(&name, frames, &name)?,
+            Some(known) if is_map(known) => previous.rename(&name, &folder.inner(MAPS)?, &name)?,
+            _ => previous.rename(&name, folder, &name)?,
+        }
     }
     folder.remove_folder(PREVIOUS)
 }
@@ -434,14 +525,21 @@ fn restore(folder: &Folder, frames: &Folder, previous: &Folder) -> io::Result<()
 /// A file of a run.
 struct OldFile {
     name: OsString,
-    /// In `frames`.
-    is_picture: bool,
+    place: Place,
+}
+
+/// Where a file of a run is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Place {
+    Run,
+    Frames,
+    Maps,
 }
 
 impl OldFile {
     /// Whether it may be lost, as the files of a run that failed before its first frame.
     fn is_empty(&self, folder: &Folder) -> bool {
-        if self.name == RECORDS || self.name == OLDER_RECORDS { folder.length(&self.name) == Some(0) } else { !self.is_picture }
+        if self.name == RECORDS || self.name == OLDER_RECORDS { folder.length(&self.name) == Some(0) } else { self.place == Place::Run }
     }
 }
 
@@ -449,13 +547,17 @@ impl OldFile {
 fn run_files(folder: &Folder, frames: Option<&Folder>) -> io::Result<Vec<OldFile>> {
     let known = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"];
     let mut files: Vec<OldFile> =
-        known.into_iter().filter(|name| folder.has(name)).map(|name| OldFile { name: name.into(), is_picture: false }).collect();
+        known.into_iter().filter(|name| folder.has(name)).map(|name| OldFile { name: name.into(), place: Place::Run }).collect();
     if folder.has(SCENE) && is_ours(&folder.path().join(SCENE))? {
-        files.push(OldFile { name: SCENE.into(), is_picture: false });
+        files.push(OldFile { name: SCENE.into(), place: Place::Run });
     }
     if let Some(frames) = frames {
         let pictures = frames.names()?.into_iter().filter(|name| name.to_str().is_some_and(is_picture));
-        files.extend(pictures.map(|name| OldFile { name, is_picture: true }));
+        files.extend(pictures.map(|name| OldFile { name, place: Place::Frames }));
+    }
+    if let Some(maps) = folder.existing(MAPS)? {
+        let found = maps.names()?.into_iter().filter(|name| name.to_str().is_some_and(is_map));
+        files.extend(found.map(|name| OldFile { name, place: Place::Maps }));
     }
     Ok(files)
 }
@@ -474,14 +576,27 @@ fn occupied(path: &Path) -> io::Result<Option<String>> {
     if files.iter().all(|file| file.is_empty(&folder)) {
         return Ok(None);
     }
-    let shown = |file: &OldFile| if file.is_picture { Path::new(FRAMES).join(&file.name) } else { PathBuf::from(&file.name) };
+    let shown = |file: &OldFile| match file.place {
+        Place::Run => PathBuf::from(&file.name),
+        Place::Frames => Path::new(FRAMES).join(&file.name),
+        Place::Maps => Path::new(MAPS).join(&file.name),
+    };
     Ok(files.first().map(|file| shown(file).display().to_string()))
 }
 
 /// Whether the name is that of a picture of a run, complete or not.
 fn is_picture(name: &str) -> bool {
+    is_numbered(name, "frame_", [".exr", ".png"])
+}
+
+/// Whether the name is that of a map of a run or of its record, complete or not.
+fn is_map(name: &str) -> bool {
+    is_numbered(name, "slide_", [".png", ".json"])
+}
+
+fn is_numbered(name: &str, begin: &str, ends: [&str; 2]) -> bool {
     let name = name.strip_prefix('.').and_then(|n| n.strip_suffix(".part")).unwrap_or(name);
-    let number = name.strip_prefix("frame_").and_then(|n| n.strip_suffix(".exr").or_else(|| n.strip_suffix(".png")));
+    let number = name.strip_prefix(begin).and_then(|n| ends.iter().find_map(|end| n.strip_suffix(end)));
     number.is_some_and(|n| n.len() >= 6 && n.bytes().all(|b| b.is_ascii_digit()))
 }
 

@@ -86,6 +86,8 @@ pub struct PublishSettings {
     pub records_bytes: Option<u64>,
     /// Whether a PNG of each frame is written.
     pub preview: bool,
+    /// Whether a replay of a flow in two dimensions writes a map of each slide.
+    pub maps: bool,
     /// Frames whose EXR is written.
     pub exr: ExrFrames,
     /// Policy when the disk is slower than the cycle. `None` waits; for live runs see [`PublishSettings::of_live_run`].
@@ -104,6 +106,7 @@ impl Default for PublishSettings {
             keep_bytes: None,
             records_bytes: None,
             preview: true,
+            maps: true,
             exr: ExrFrames::Slide,
             when_disk_slow: None,
         }

@@ -118,6 +118,12 @@ pub struct FileStatistics {
     pub pictures_removed: u64,
     /// EXR files deleted because a later frame of their slide has one (`exr = "slide"`).
     pub exr_replaced: u64,
+    /// Maps of slides written.
+    #[serde(default)]
+    pub maps_written: u64,
+    /// Maps of slides that the disk refused.
+    #[serde(default)]
+    pub maps_failed: u64,
     /// Bytes of pictures written.
     pub bytes_written: u64,
     /// Bytes of the pictures not removed.
@@ -156,12 +162,18 @@ impl MovieStatistics {
 }
 
 impl FileStatistics {
-    /// Describes records and pictures lost. `None` if everything is written, apart from what settings drop.
+    /// Whether maps are lost, and all pictures and records are written.
+    pub fn lost_only_maps(&self) -> bool {
+        self.maps_failed > 0 && self.pictures_failed + self.unfinished + self.records_lost == 0
+    }
+
+    /// Describes records, pictures and maps lost. `None` if everything is written, apart from what settings drop.
     pub fn lost(&self) -> Option<String> {
-        let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, .. } = *self;
+        let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, maps_failed, .. } = *self;
         let lost = pictures_failed + unfinished;
         let why = self.refused.as_deref().unwrap_or("the disk does not answer");
         match (lost, records_lost) {
+            (0, 0) if self.lost_only_maps() => Some(format!("{maps_failed} maps are lost ({why})")),
             (0, 0) => None,
             (0, records) => Some(format!("{records} records are lost ({why})")),
             (failed, _) => Some(format!(

@@ -69,6 +69,16 @@ pub enum Event {
     Frame(Frame),
     /// Share of the current frame that is rendered.
     Progress(f32),
+    /// After the first frame of a slide: what was traced for it.
+    Slide(ShownSlide),
+}
+
+/// A slide of which a frame is made.
+pub struct ShownSlide {
+    /// The slide.
+    pub slide: Slide,
+    /// The flow map of its frame, with the steps that were chosen.
+    pub map: FlowMap,
 }
 
 /// Summary of a run.
@@ -668,6 +678,9 @@ impl<B: Backend> Cycle<'_, B> {
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
             sink(Event::Frame(frame));
+            if number == 0 {
+                sink(Event::Slide(ShownSlide { slide: slide.clone(), map: self.map.clone() }));
+            }
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
             number += 1;

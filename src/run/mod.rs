@@ -27,7 +27,7 @@ mod transaction;
 pub use crate::trust::TrustedError;
 pub use checkpoints::CheckpointTotals;
 pub use color_bar::ColorBar;
-pub use cycle::{Event, RunOptions, RunReport, run, run_on};
+pub use cycle::{Event, RunOptions, RunReport, ShownSlide, run, run_on};
 pub use error::RunError;
 pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;

@@ -7,7 +7,7 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// A current along 20 by 10 degrees over four days, a jet that meanders; an island in the south-west quarter.
-fn ocean(folder: &Path) -> PathBuf {
+pub(crate) fn ocean(folder: &Path) -> PathBuf {
     let lon: Vec<f64> = (0..41).map(|i| 15.0 + 0.5 * f64::from(i)).collect();
     let lat: Vec<f64> = (0..21).map(|j| -40.0 + 0.5 * f64::from(j)).collect();
     let time: Vec<f64> = (0..9).map(|t| 12.0 * f64::from(t)).collect();

@@ -187,8 +187,11 @@ fn lost_pictures_are_a_failure() {
     assert!(!said.contains("frames in run/frames"), "{said}");
     let (status, said) = replay("--json");
     assert!(status == Some(1) && said.contains("0 of 2 pictures written"), "{status:?} {said}");
-    // Without EXR files, everything that was asked for exists.
+    // A map is larger as well.
     let (status, said) = replay("--set publish.exr=none");
+    assert!(status == Some(1) && said.contains("run/maps: 2 maps are lost (File too large"), "{status:?} {said}");
+    // Without EXR files and maps, everything that was asked for exists.
+    let (status, said) = replay("--set publish.exr=none --set publish.maps=false");
     assert!(status == Some(0) && said.contains("frames in run/frames"), "{status:?} {said}");
 }
 
