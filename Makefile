@@ -99,6 +99,8 @@ demo: build
 
 # All tests use the release profile: dependencies are built once, and numerics run optimised.
 test: packages python-packages
+	@# Serves an archive over HTTPS.
+	@command -v openssl >/dev/null || { $(call install,openssl); }
 	$(CARGO) test --release --workspace
 	@if $(MAKE) --no-print-directory $(NVRTC)/done; then \
 	  LD_LIBRARY_PATH="$(CURDIR)/$(NVRTC)/nvidia/cu13/lib:$$LD_LIBRARY_PATH" $(CARGO) test --release --test kernels_compile -- --ignored; else \

@@ -304,7 +304,7 @@ fn work(
             // A signal ends the run soon.
             if let Some(drawing) = maps.as_mut().filter(|_| !stop.load(Ordering::Relaxed)) {
                 bar.set_message(format!("map of slide {}", shown.slide.index));
-                match drawing.draw(shown) {
+                match drawing.draw(*shown) {
                     Ok((map, notes)) => {
                         notes.iter().for_each(|text| bar.suspend(|| messages::note(text)));
                         output.map(map);

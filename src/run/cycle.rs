@@ -70,7 +70,7 @@ pub enum Event {
     /// Share of the current frame that is rendered.
     Progress(f32),
     /// After the first frame of a slide: what was traced for it.
-    Slide(ShownSlide),
+    Slide(Box<ShownSlide>),
 }
 
 /// A slide of which a frame is made.
@@ -679,7 +679,7 @@ impl<B: Backend> Cycle<'_, B> {
             let is_done = target.is_some_and(is_good) && number >= warmups;
             sink(Event::Frame(frame));
             if number == 0 {
-                sink(Event::Slide(ShownSlide { slide: slide.clone(), map: self.map.clone() }));
+                sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map: self.map.clone() })));
             }
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;

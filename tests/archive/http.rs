@@ -332,11 +332,12 @@ fn a_redirect_is_followed_and_a_credential_stays_with_its_host() {
 
 /// Serves a folder by `openssl s_server`.
 fn encrypted(folder: &Path, certificate: &Path, key: &Path) -> (program::Running, u16) {
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let mut command = Command::new("openssl");
-    command.args(["s_server", "-WWW", "-accept", &format!("127.0.0.1:{port}"), "-cert"]).arg(certificate).arg("-key").arg(key);
+    command.args(["s_server", "-WWW", "-accept", "127.0.0.1:0", "-cert"]).arg(certificate).arg("-key").arg(key);
     let server = program::start(command.current_dir(folder));
-    program::until("the server's start", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
+    let port = || server.stdout().lines().find_map(|line| line.strip_prefix("ACCEPT 127.0.0.1:").and_then(|port| port.parse().ok()));
+    program::until("the server's start", || port().is_some());
+    let port = port().unwrap();
     (server, port)
 }
 
