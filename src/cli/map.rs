@@ -188,6 +188,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let result = map::make(&moment, &wanted, &device, &mut |done, total| {
         bar.set_length(total);
         bar.set_position(done);
+        true
     })
     .map_err(|error| explained(&scene, error))?;
     bar.finish_and_clear();

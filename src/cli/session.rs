@@ -8,7 +8,7 @@ use super::signals::Stop;
 use super::{dashboard, messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::map::{SlideMaps, annotated};
+use ridgewatch::map::{MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
     DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
     WhenDiskSlow,
@@ -304,11 +304,12 @@ fn work(
             // A signal ends the run soon.
             if let Some(drawing) = maps.as_mut().filter(|_| !stop.load(Ordering::Relaxed)) {
                 bar.set_message(format!("map of slide {}", shown.slide.index));
-                match drawing.draw(*shown) {
+                match drawing.draw(*shown, stop) {
                     Ok((map, notes)) => {
                         notes.iter().for_each(|text| bar.suspend(|| messages::note(text)));
                         output.map(map);
                     }
+                    Err(MapError::Stopped) => {}
                     Err(error) => {
                         bar.suspend(|| messages::note(format_args!("no maps from here on: {error}; the frames go on")));
                         maps = None;

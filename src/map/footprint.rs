@@ -151,11 +151,16 @@ pub(super) fn offsets(sampling: Sampling, pixel: usize, half: usize) -> impl Ite
 }
 
 impl Raster {
-    /// Traces the pixels of a view. Calls `done` with the number of pixels after each part.
+    /// Traces the pixels of a view. Calls `done` with the number of pixels after each part; `None` once that returns false.
     ///
     /// # Errors
     /// The device fails.
-    pub fn trace(view: &View, tracer: &mut MapTracer<'_>, sampling: Sampling, done: &mut dyn FnMut(usize)) -> Result<Self, BackendError> {
+    pub fn trace(
+        view: &View,
+        tracer: &mut MapTracer<'_>,
+        sampling: Sampling,
+        done: &mut dyn FnMut(usize) -> bool,
+    ) -> Result<Option<Self>, BackendError> {
         let count = view.size[0] * view.size[1];
         let mut raster = Self { size: view.size, mean: vec![f32::NAN; count], missing: vec![f32::NAN; count], error: None, failed: 0 };
         let mut variances = Variances::default();
@@ -192,10 +197,12 @@ impl Raster {
                     variances.add([sum[0] / number[0] as f64, sum[1] / number[1] as f64]);
                 }
             }
-            done(part.len());
+            if !done(part.len()) {
+                return Ok(None);
+            }
         }
         raster.error = variances.error();
-        Ok(raster)
+        Ok(Some(raster))
     }
 
     /// Whether most of a pixel has no velocity.

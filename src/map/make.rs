@@ -72,11 +72,16 @@ struct Traced {
     ridges: Vec<RidgeLine>,
 }
 
-/// Makes the map of a moment. Calls `progress` with the seeds traced and those in all.
+/// Makes the map of a moment. Calls `progress` with the seeds traced and those in all; once it returns false, the map is abandoned.
 ///
 /// # Errors
 /// An option does not fit the domain, or the device fails.
-pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &mut dyn FnMut(u64, u64)) -> Result<MapResult, MapError> {
+pub fn make(
+    moment: &Moment,
+    options: &MapOptions,
+    device: &Device,
+    progress: &mut dyn FnMut(u64, u64) -> bool,
+) -> Result<MapResult, MapError> {
     let plan = &moment.plan;
     let domain = &plan.domain;
     let level = level(options.level, domain)?;
@@ -100,13 +105,17 @@ pub fn make(moment: &Moment, options: &MapOptions, device: &Device, progress: &m
             let mut tracer = MapTracer::new(device, &moment.velocity, &map, moment.time).map_err(RunError::of)?;
             let mut count = |seeds: u64| {
                 done += seeds;
-                progress(done, total);
+                progress(done, total)
             };
-            let raster = Raster::trace(&view, &mut tracer, options.sampling, &mut |pixels| count((pixels * options.sampling.seeds) as u64))
-                .map_err(RunError::of)?;
+            let traced_raster =
+                Raster::trace(&view, &mut tracer, options.sampling, &mut |pixels| count((pixels * options.sampling.seeds) as u64))
+                    .map_err(RunError::of)?;
+            let Some(raster) = traced_raster else { return Err(MapError::Stopped) };
             let mut ridges = Vec::new();
             if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
-                let field = ridge_field(&view, &mut tracer, size, &mut |seeds| count(seeds as u64))?;
+                let field = ridge_field(&view, &mut tracer, size, &mut |seeds| {
+                    count(seeds as u64);
+                })?;
                 let kind = structures(direction);
                 ridges = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
             }

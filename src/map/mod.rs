@@ -66,6 +66,9 @@ pub enum MapError {
     /// The scene, its source or the device fails.
     #[error(transparent)]
     Run(#[from] RunError),
+    /// Whoever watches the progress ended it.
+    #[error("the map was abandoned")]
+    Stopped,
     /// No pixel has a velocity.
     #[error("no pixel has a velocity at {0}: all seeds lie on missing cells (fill values or NaN; `ridgewatch inspect` counts them)")]
     AllMissing(String),

@@ -11,7 +11,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
-/// Maximum number of queued frames with pictures.
+/// Maximum number of queued frames with pictures, and of queued maps.
 const MAX_PICTURES: usize = 4;
 /// Maximum number of queued records.
 const MAX_RECORDS: usize = 1024;
@@ -47,10 +47,18 @@ struct State {
     queue: VecDeque<Job>,
     /// Frames with pictures in `queue`.
     pictures: usize,
-    /// Whether a job is being written.
-    busy: bool,
+    /// Maps in `queue`.
+    maps: usize,
+    /// The job that is being written.
+    busy: Option<Busy>,
     closed: bool,
     statistics: FileStatistics,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Busy {
+    Frame,
+    Map,
 }
 
 #[derive(Debug)]
@@ -104,23 +112,34 @@ impl FileWriter {
             state.drop_oldest_pictures(self.when_disk_slow);
         }
         if state.queue.len() >= MAX_RECORDS {
-            // The first jobs are records, since their pictures were dropped before.
-            state.queue.pop_front();
-            state.statistics.records_lost += 1;
+            // Few of the jobs have pictures or are maps.
+            let oldest = state.queue.iter().position(|job| matches!(job, Job::Record(_)));
+            if let Some(oldest) = oldest {
+                state.queue.remove(oldest);
+                state.statistics.records_lost += 1;
+            }
         }
         state.queue.push_back(Job::Whole(frame));
         state.pictures += 1;
         self.shared.changed.notify_all();
     }
 
-    /// Queues the map of a slide, whose frame was queued before. One that finds the queue full is dropped as a record is.
+    /// Queues the map of a slide, whose frame was queued before. It waits for a place as a frame does; without one the map is left out.
     pub(super) fn map(&self, map: SlideMap) {
         let mut state = self.shared.lock();
-        if state.queue.len() >= MAX_RECORDS {
-            state.statistics.maps_failed += 1;
+        if self.when_disk_slow == WhenDiskSlow::Wait {
+            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.maps >= MAX_PICTURES);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        if state.maps >= MAX_PICTURES {
+            match self.when_disk_slow {
+                WhenDiskSlow::Wait => state.statistics.maps_failed += 1,
+                WhenDiskSlow::Drop => state.statistics.maps_dropped += 1,
+            }
             return;
         }
         state.queue.push_back(Job::Map(map));
+        state.maps += 1;
         self.shared.changed.notify_all();
     }
 
@@ -130,12 +149,16 @@ impl FileWriter {
         let mut state = self.shared.lock();
         state.closed = true;
         self.shared.changed.notify_all();
-        while !state.queue.is_empty() || state.busy {
+        while !state.queue.is_empty() || state.busy.is_some() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 let mut statistics = state.statistics.clone();
-                statistics.unfinished = (state.pictures + usize::from(state.busy)) as u64;
-                tracing::error!("the disk did not take the last {} frames within {:?}", statistics.unfinished, self.limit);
+                let busy = |with: Busy| usize::from(state.busy == Some(with));
+                statistics.unfinished = (state.pictures + busy(Busy::Frame)) as u64;
+                let maps = (state.maps + busy(Busy::Map)) as u64;
+                statistics.maps_failed += maps;
+                let unfinished = statistics.unfinished;
+                tracing::error!("the disk did not take the last {unfinished} frames and {maps} maps within {:?}", self.limit);
                 return (None, statistics);
             }
             state = self.shared.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
@@ -173,7 +196,7 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
     let mut refused = false;
     loop {
         let mut state = shared.lock();
-        state.busy = false;
+        state.busy = None;
         shared.changed.notify_all();
         let job = loop {
             if let Some(job) = state.queue.pop_front() {
@@ -184,10 +207,9 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
             }
             state = shared.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
         };
-        state.busy = true;
-        if matches!(job, Job::Whole(_)) {
-            state.pictures -= 1;
-        }
+        state.busy = Some(if matches!(job, Job::Map(_)) { Busy::Map } else { Busy::Frame });
+        state.pictures -= usize::from(matches!(job, Job::Whole(_)));
+        state.maps -= usize::from(matches!(job, Job::Map(_)));
         // A place is free.
         shared.changed.notify_all();
         drop(state);
@@ -198,8 +220,13 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
             Job::Map(map) => {
                 let written = folder.write_map(map, settings);
                 let statistics = &mut shared.lock().statistics;
-                statistics.maps_written += u64::from(written.is_ok());
-                statistics.maps_failed += u64::from(written.is_err());
+                match written {
+                    Ok(bytes) => {
+                        statistics.maps_written += 1;
+                        statistics.bytes_written += bytes;
+                    }
+                    Err(_) => statistics.maps_failed += 1,
+                }
                 if let Err(error) = written {
                     let path = folder.path().display();
                     if statistics.maps_failed == 1 {

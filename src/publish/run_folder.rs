@@ -355,11 +355,11 @@ impl RunFolder {
         Ok(Written { bytes, removed: self.make_room(settings), replaced })
     }
 
-    /// Writes the map of a slide. With `keep` no more maps stay than frames may.
+    /// Writes the map of a slide, and returns its bytes. With `keep` no more maps stay than frames may, and older ones go beyond `keep_bytes`.
     ///
     /// # Errors
     /// Errors of the system. Then no file of the map remains.
-    pub fn write_map(&mut self, map: &SlideMap, settings: &PublishSettings) -> io::Result<()> {
+    pub fn write_map(&mut self, map: &SlideMap, settings: &PublishSettings) -> io::Result<u64> {
         let maps = match self.maps.take() {
             Some(maps) => maps,
             None => {
@@ -379,12 +379,14 @@ impl RunFolder {
             }
             new.files.push((file, bytes.len() as u64));
         }
-        self.kept_bytes += new.bytes();
+        let bytes = new.bytes();
+        self.kept_bytes += bytes;
         self.kept_maps.push_back(new);
-        while self.kept_maps.len() > settings.keep.unwrap_or(usize::MAX) {
+        let (max, max_bytes) = (settings.keep.unwrap_or(usize::MAX), settings.keep_bytes.unwrap_or(u64::MAX));
+        while self.kept_maps.len() > max || (self.kept_maps.len() > 1 && self.kept_bytes > max_bytes) {
             self.remove_oldest_map();
         }
-        Ok(())
+        Ok(bytes)
     }
 
     fn remove_oldest_map(&mut self) {

@@ -121,12 +121,15 @@ pub struct FileStatistics {
     /// Maps of slides written.
     #[serde(default)]
     pub maps_written: u64,
-    /// Maps of slides that the disk refused.
+    /// Maps of slides that the disk refused, or had not taken when the run stopped waiting for it.
     #[serde(default)]
     pub maps_failed: u64,
-    /// Bytes of pictures written.
+    /// Maps of slides dropped because the disk was slower than the cycle.
+    #[serde(default)]
+    pub maps_dropped: u64,
+    /// Bytes of pictures and maps written.
     pub bytes_written: u64,
-    /// Bytes of the pictures not removed.
+    /// Bytes of the pictures and maps not removed.
     pub bytes_kept: u64,
     /// Frames not written when the run stopped waiting for the disk.
     pub unfinished: u64,
@@ -172,12 +175,13 @@ impl FileStatistics {
         let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, maps_failed, .. } = *self;
         let lost = pictures_failed + unfinished;
         let why = self.refused.as_deref().unwrap_or("the disk does not answer");
+        let maps = if maps_failed > 0 { format!(", and {maps_failed} maps") } else { String::new() };
         match (lost, records_lost) {
             (0, 0) if self.lost_only_maps() => Some(format!("{maps_failed} maps are lost ({why})")),
             (0, 0) => None,
-            (0, records) => Some(format!("{records} records are lost ({why})")),
+            (0, records) => Some(format!("{records} records{maps} are lost ({why})")),
             (failed, _) => Some(format!(
-                "{pictures_written} of {} pictures written ({failed} failed: {why})",
+                "{pictures_written} of {} pictures written ({failed} failed{maps}: {why})",
                 pictures_written + pictures_dropped + failed
             )),
         }

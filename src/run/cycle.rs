@@ -678,11 +678,11 @@ impl<B: Backend> Cycle<'_, B> {
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
             sink(Event::Frame(frame));
+            transaction!(self, slide, run, on => run.checkpoint_if_due(on));
+            self.run.check_end()?;
             if number == 0 {
                 sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map: self.map.clone() })));
             }
-            transaction!(self, slide, run, on => run.checkpoint_if_due(on));
-            self.run.check_end()?;
             number += 1;
             since_command = since_command.map(|frames: usize| frames + 1);
             if self.run.is_paused() {

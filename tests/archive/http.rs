@@ -10,6 +10,8 @@ use ridgewatch::source::SnapshotSource;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use tempfile::tempdir;
 
@@ -185,12 +187,14 @@ fn what_is_no_store_is_refused() {
         (Answer::Bytes(b"{}".to_vec()), &["without consolidated metadata"]),
         (Answer::Announce(1 << 30), &["`zarr.json`"]),
         (Answer::Redirect("/x.zarr/zarr.json".into()), &["redirected more than 4 times"]),
+        (Answer::Redirect("/a b?signature=hunter2".into()), &["`zarr.json`: it is redirected", "`Location`"]),
     ] {
         let server = answers(answer);
         std::fs::create_dir_all(dir.path().join("x.zarr")).unwrap();
         std::fs::write(dir.path().join("x.zarr/zarr.json"), b"{}").unwrap();
         let url = server.url("x.zarr");
-        refused(&[&url], "", &[&[url.to_str().unwrap()], pieces].concat());
+        let said = refused(&[&url], "", &[&[url.to_str().unwrap()], pieces].concat()).to_string();
+        assert!(!said.contains("hunter2"), "{said}");
     }
     // Nobody listens.
     let gone = answers(Answer::File).url("x.zarr");
@@ -258,17 +262,39 @@ fn a_chunk_that_is_forbidden_is_missing_while_the_store_may_be_read() {
     let unlisted = move |request: &Request| if root.join(&request.path).exists() { Answer::File } else { Answer::Status(403) };
     let server = Server::start(dir.path(), Line::default(), unlisted);
     same(&mut open(&[server.url("a.zarr")]), &mut open(&[&folder]), "403 for what is not stored");
-    // The access ends after the store was opened.
-    let ended = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
-    let over = ended.clone();
-    let server = Server::start(dir.path(), Line::default(), move |_| {
-        if over.load(std::sync::atomic::Ordering::SeqCst) { Answer::Status(403) } else { Answer::File }
-    });
-    let mut archive = open_with(&[server.url("a.zarr")], "mask = \"none\"");
-    archive.read(0).unwrap();
-    ended.store(true, std::sync::atomic::Ordering::SeqCst);
-    let message = archive.read(1).unwrap_err().to_string();
-    assert!(message.contains("status 403") && message.contains("asks for credentials"), "{message}");
+    // One look at the metadata serves for all chunks that a request for a variable does not find, and they are not asked for again.
+    server.take();
+    let mut archive = open(&[server.url("a.zarr")]);
+    archive.read(1).unwrap();
+    let requests = server.take();
+    let looks = requests.iter().filter(|request| request.path.ends_with(".zmetadata") && request.range.is_some()).count();
+    let missing = requests.iter().filter(|request| is_chunk(request) && !dir.path().join(&request.path).exists()).count();
+    assert!((1..=missing).contains(&looks), "{looks} looks for {missing} chunks");
+    archive.read(1).unwrap();
+    assert_eq!(server.take(), []);
+}
+
+#[test]
+fn a_store_that_goes_away_ends_the_reading() {
+    let dir = tempdir().unwrap();
+    let folder = write(&field(), &OLD, &dir.path().join("a.zarr"));
+    let settings = "mask = \"none\"";
+    for status in [403, 404, 410] {
+        let gone = Arc::new(AtomicBool::new(false));
+        let over = gone.clone();
+        let answer = move |_: &Request| if over.load(Ordering::SeqCst) { Answer::Status(status) } else { Answer::File };
+        let server = Server::start(dir.path(), Line::default(), answer);
+        let mut archive = open_with(&[server.url("a.zarr")], settings);
+        archive.read(0).unwrap();
+        gone.store(true, Ordering::SeqCst);
+        let message = archive.read(1).unwrap_err().to_string();
+        let looked = format!("`.zmetadata`: status {status}");
+        assert!(["/1.", "it was not found", &looked].into_iter().all(|piece| message.contains(piece)), "{message}");
+        assert_eq!(message.contains("asks for credentials"), status == 403, "{message}");
+        // What was not found then is asked for again.
+        gone.store(false, Ordering::SeqCst);
+        same(&mut archive, &mut open_with(&[&folder], settings), &format!("after status {status}"));
+    }
 }
 
 #[test]
@@ -291,18 +317,14 @@ fn only_the_chunks_in_question_are_asked_for_and_at_once() {
         let mut archive = open_with(&[&url], region);
         let expected = open_with(&[&folder], region).read(2).unwrap().nodes.clone();
         server.take();
-        let begin = Instant::now();
         assert_eq!(archive.read(2).unwrap().nodes, expected);
-        let elapsed = begin.elapsed();
         let chunks: Vec<Request> = server.take().into_iter().filter(is_chunk).collect();
         let different: BTreeSet<_> = chunks.iter().map(|request| (request.path.clone(), request.range.clone())).collect();
         // Nodes 0 to 11: three tiles of four along x and along y, of two variables; one index for each shard, which holds them all.
         let (tiles, indices) = (2 * 3 * 3, if layout.shards > 1 { 2 } else { 0 });
         assert_eq!((chunks.len(), different.len()), (tiles + indices, tiles + indices), "{chunks:#?}");
         let most = server.most_at_once();
-        assert!((4..=16).contains(&most), "{most} at once");
-        // One after the other would take latency * requests, 0.9 s at least.
-        assert!(elapsed < latency * 14, "{name}: {elapsed:?} for {} requests", chunks.len());
+        assert!((4..=16).contains(&most), "{name}: {most} at once");
         // What was read serves again.
         archive.read(2).unwrap();
         assert_eq!(server.take(), []);
@@ -324,6 +346,8 @@ fn a_redirect_is_followed_and_a_credential_stays_with_its_host() {
     assert!(first.take().iter().chain(&other.take()).all(|request| request.authorization.is_none()));
     let mut command = program::ridgewatch(["inspect", program::text(&url)]);
     command.env("RIDGEWATCH_HTTP_AUTHORIZATION", format!("{} Bearer secret", first.address())).env("RIDGEWATCH_LOG", "trace");
+    // Nobody listens there: what is sent to this machine takes no proxy.
+    command.env("ALL_PROXY", "http://127.0.0.1:1").env_remove("NO_PROXY").env_remove("no_proxy");
     let outcome = program::run(&mut command).success();
     assert!(!outcome.stderr.contains("secret") && !outcome.stdout.contains("secret"), "{}", outcome.stderr);
     assert!(first.take().iter().all(|request| request.authorization.as_deref() == Some("Bearer secret")));

@@ -160,12 +160,13 @@ impl Shared {
         let mut reader = BufReader::new(stream.try_clone().unwrap());
         let mut stream = stream;
         while let Some(request) = self.request(&mut reader) {
+            // Before the answer: who has it may ask for the list at once.
+            self.requests.lock().unwrap().push(request.clone());
             let now = self.now.fetch_add(1, Ordering::SeqCst) + 1;
             self.most.fetch_max(now, Ordering::SeqCst);
             std::thread::sleep(self.line.latency);
             let again = self.answer(&request, &mut stream).unwrap_or(false);
             self.now.fetch_sub(1, Ordering::SeqCst);
-            self.requests.lock().unwrap().push(request);
             if !again {
                 let _ = stream.shutdown(std::net::Shutdown::Both);
                 return;

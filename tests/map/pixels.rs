@@ -16,7 +16,11 @@ fn stopped_saddle(seeds: usize, seed: u64) -> (View, Raster) {
     let view = View::new(&domain, false, None, 0.5, 64).unwrap();
     assert_eq!((view.size, view.projection.kind()), ([64, 64], ProjectionKind::Plain));
     let mut done = 0;
-    let raster = Raster::trace(&view, &mut tracer, Sampling { seeds, seed }, &mut |pixels| done += pixels).unwrap();
+    let mut count = |pixels| {
+        done += pixels;
+        true
+    };
+    let raster = Raster::trace(&view, &mut tracer, Sampling { seeds, seed }, &mut count).unwrap().unwrap();
     assert_eq!(done, 64 * 64);
     (view, raster)
 }

@@ -32,7 +32,8 @@ const steering = new Steering({
   told: (text, frame, urgent) => (urgent ? warnings.hold("command", text, frame) : warnings.log.add(text, frame)),
   // A command is followed live.
   acted: () => { if (picture.held) picture.follow(); },
-  refused: (set) => { if (set.transfer) histogram.forget(); },
+  // A newer range may wait.
+  refused: (set) => { if (set.transfer && steering.waiting.transfer === undefined) histogram.forget(); },
 });
 
 const values = new Values({

@@ -1,8 +1,8 @@
 //! Combination of the marched picture with its noisy correction, and the error of the result.
 //!
-//! First goes the part that the marched picture tells (see `regression`). The rest is shrunk before it is added, as Stein-type estimators combine a biased estimate with an unbiased one (James and Stein 1961; Back
-//! et al. 2020), here in the scales of an a-trous B3-spline transform (Starck and Murtagh 2006). The samples form two halves, and each half two
-//! quarters. The product of two quarters' details estimates the energy of the correction itself without noise, their squares that of correction
+//! First goes the part that the marched picture tells (see `regression`). The rest is shrunk before it is added, as Stein-type estimators combine a
+//! biased estimate with an unbiased one (James and Stein 1961; Back et al. 2020), here in the scales of an a-trous B3-spline transform (Starck and
+//! Murtagh 2006). The samples form two halves, and each half two quarters. The product of two quarters' details estimates the energy of the correction itself without noise, their squares that of correction
 //! and noise together; the ratio is the gain. Each half is shrunk by its own gains, so that the other half is independent of it and scores it:
 //! with d_A and d_B the means of the halves at a pixel, r = (a + b) / 2 the correction shown and c its expectation,
 //! r^2 - (a d_B + b d_A) + d_A d_B is an unbiased estimate of (r - c)^2. As samples come, gains go to 1 wherever there is anything to correct.
@@ -359,22 +359,28 @@ mod tests {
         }
     }
 
-    /// A correction that the marched picture tells is found at once, where shrinkage leaves most of it away; and its error is stated right.
+    /// A correction that the marched picture's details tell is found at once, where shrinkage leaves most of it away; and its error is stated right.
     #[test]
     fn what_the_marched_picture_tells_is_regressed() {
         let (width, height) = (128, 96);
         // Detail of single pixels, which shrinkage takes for noise.
-        let shown: Vec<f32> = (0..width * height).map(|i| unit(philox([i as u32, 0, 0, 0], [7, 2])[0])).collect();
-        let truth: Vec<f32> = shown.iter().map(|shown| 0.3 * shown - 0.1).collect();
-        let ray = |shown: &f32| RaySum { radiance: [*shown; 3], alpha: 1.0, ..RaySum::default() };
-        let guides = Guides::new(&shown.iter().map(ray).collect::<Vec<_>>(), 1, width);
+        let rays: Vec<RaySum> = (0..(width * height) as u32)
+            .map(|i| {
+                let [radiance, alpha, ftle, _] = philox([i, 0, 0, 0], [7, 2]).map(unit);
+                RaySum { radiance: [radiance; 3], alpha: 0.5 + 0.5 * alpha, ftle, missing: 0.0 }
+            })
+            .collect();
+        let correction = |ray: &RaySum| 0.3 * ray.radiance[0] - 0.4 * ray.alpha + 0.2 * ray.ftle - 0.5 * ray.ftle * ray.radiance[0];
+        let truth: Vec<f32> = rays.iter().map(correction).collect();
+        let guides = Guides::new(&rays, 1, width);
+        let dark = dark(width, height);
         let (mut stated, mut found, mut without) = (0.0, 0.0, 0.0);
         for seed in 0..8 {
             let sums = sampled(&truth, 0.5, 2, 40 + seed);
             let combined = combine(&sums, &guides, Correction::Shrunk);
             stated += combined.squared.iter().map(|e| f64::from(e[0][0])).sum::<f64>() / truth.len() as f64;
             found += error_of(&combined, &truth);
-            without += error_of(&combine(&sums, &dark(width, height), Correction::Shrunk), &truth);
+            without += error_of(&combine(&sums, &dark, Correction::Shrunk), &truth);
         }
         assert!(found < 0.1 * without, "{found} {without}");
         // Its scatter is that of the products of noise, 0.25 / 4 a pixel and half.

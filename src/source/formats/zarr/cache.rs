@@ -21,6 +21,8 @@ pub struct Cache {
 struct Held {
     /// `None` if the store lacks it.
     data: Option<Arc<Vec<u8>>>,
+    /// Whether it is sure that the store lacks it, if it does.
+    confirmed: bool,
     bytes: u64,
     extents: Vec<usize>,
     /// Requests for the variable since one reached it.
@@ -44,7 +46,13 @@ impl Cache {
             held.idle = if reached(origin, &held.extents) { 0 } else { held.idle + 1 };
         }
         self.spare = true;
-        self.keep_if(|held| held.idle <= IDLE);
+        // What is not confirmed is left by a request that failed.
+        self.keep_if(|held| held.confirmed && held.idle <= IDLE);
+    }
+
+    /// What the store was found to lack is kept beyond this request.
+    pub fn confirm(&mut self) {
+        self.held.values_mut().for_each(|held| held.confirmed = true);
     }
 
     fn keep_if(&mut self, keep: impl Fn(&Held) -> bool) {
@@ -56,16 +64,15 @@ impl Cache {
         self.held.get(key).map(|held| held.data.clone())
     }
 
-    /// Keeps a chunk if there is room.
+    /// Keeps a chunk if there is room. One that the store lacks is kept for this request, until [`Self::confirm`].
     pub fn keep(&mut self, key: Key, extents: &[usize], data: &Option<Arc<Vec<u8>>>) {
         let bytes = data.as_ref().map_or(0, |data| data.capacity() as u64) + ENTRY_BYTES;
         if self.bytes + bytes > self.most && self.spare {
             self.keep_if(|held| held.idle == 0);
             self.spare = false;
         }
-        if self.bytes + bytes <= self.most
-            && self.held.insert(key, Held { data: data.clone(), bytes, extents: extents.to_vec(), idle: 0 }).is_none()
-        {
+        let held = Held { data: data.clone(), confirmed: data.is_some(), bytes, extents: extents.to_vec(), idle: 0 };
+        if self.bytes + bytes <= self.most && self.held.insert(key, held).is_none() {
             self.bytes += bytes;
         }
     }
@@ -107,6 +114,21 @@ mod tests {
         let half = unpacked(5 * one, 24, 6, 5);
         assert!(half > 3.0 && half < 4.5, "{half}");
         assert_eq!(unpacked(0, 24, 6, 5), 6.0);
+    }
+
+    #[test]
+    fn what_is_missing_is_kept_once_it_is_confirmed() {
+        let mut cache = Cache::new(u64::MAX);
+        let key = |chunk: usize| -> Key { (0, vec![chunk], false) };
+        cache.begin(0, &[0], &[3]);
+        cache.keep(key(0), &[1], &None);
+        cache.confirm();
+        cache.keep(key(1), &[1], &None);
+        cache.keep(key(2), &[1], &Some(Arc::new(vec![0; 1000])));
+        assert!((0..3).all(|chunk| cache.get(&key(chunk)).is_some()));
+        // The request failed: the next one asks again.
+        cache.begin(0, &[0], &[3]);
+        assert_eq!([0, 1, 2].map(|chunk| cache.get(&key(chunk)).is_some()), [true, false, true]);
     }
 
     #[test]

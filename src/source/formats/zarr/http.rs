@@ -4,11 +4,13 @@ use super::super::messages::FormatFault;
 use super::parts::{METADATA, Parts, Span, checked};
 use std::env::var;
 use std::io::Read;
+use std::net::Ipv4Addr;
 use std::path::Path;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 use ureq::Agent;
+use ureq::config::RedirectAuthHeaders;
 use ureq::http::Response;
 use ureq::tls::{PemItem, RootCerts, TlsConfig, parse_pem};
 
@@ -31,8 +33,6 @@ const SLOWEST: u64 = 256 << 10;
 const MAX_SKIPPED: u64 = 64 << 20;
 /// Bytes of an error's body that are read, so that its connection can serve the next request.
 const ERROR_BYTES: u64 = 64 << 10;
-/// Time for which one look at the metadata shows that the store may still be read.
-const CONFIRMED: Duration = Duration::from_secs(5);
 /// Bytes of a file of certificates.
 const MAX_CERTIFICATES: u64 = 16 << 20;
 
@@ -69,15 +69,30 @@ pub fn checked_url(url: &str) -> Result<String, (String, String)> {
     if path.contains(['*', '[', ']', '{', '}']) {
         return refused("it is a pattern, but HTTP lists no files: name each store");
     }
-    // What follows the brackets of an address, or the name.
-    let (host, port) = match authority.rsplit_once(':') {
-        Some((host, port)) if !port.ends_with(']') => (host, port),
-        _ => (authority, "80"),
-    };
+    let (host, port) = host_and_port(authority);
     if host.is_empty() || port.parse::<u16>().is_err() || url.contains(|c: char| c.is_whitespace() || c.is_control() || c == '\\') {
         return refused("it has no host, a port that is none, or spaces or `\\`, which are written `%20` and `%5C`");
     }
     Ok(url.trim_end_matches('/').to_owned())
+}
+
+/// A host, with the brackets of an address, and its port, which may be left out.
+fn host_and_port(authority: &str) -> (&str, &str) {
+    match authority.rsplit_once(':') {
+        // A colon within brackets belongs to the address.
+        Some((host, port)) if !port.ends_with(']') => (host, port),
+        _ => (authority, "80"),
+    }
+}
+
+/// The host of a URL that was checked, with its port.
+fn authority(url: &str) -> &str {
+    url.split("://").nth(1).and_then(|rest| rest.split('/').next()).unwrap_or_default()
+}
+
+/// Whether a host is this machine, so that nothing leaves it.
+fn is_local(host: &str) -> bool {
+    host.eq_ignore_ascii_case("localhost") || host == "[::1]" || host.parse::<Ipv4Addr>().is_ok_and(|address| address.is_loopback())
 }
 
 /// The environment variable of the header `Authorization` for one host.
@@ -92,12 +107,14 @@ pub struct HttpParts {
     /// Value of the header `Authorization`.
     authorization: Option<String>,
     limit: Duration,
+    /// Whether its server is on this machine.
+    local: bool,
     /// Metadata that were read: they are there.
     known: OnceLock<String>,
-    /// When they were last seen to be readable, after an answer of 403.
-    confirmed: Mutex<Option<Instant>>,
     /// Whether metadata were answered with 403.
     denied: AtomicBool,
+    /// Whether no further tries are wanted.
+    given_up: AtomicBool,
     requests: AtomicU64,
 }
 
@@ -132,20 +149,27 @@ impl HttpParts {
             url: url.to_owned(),
             authorization,
             limit: Duration::from_secs(limit),
+            local: is_local(host_and_port(authority(url)).0),
             known: OnceLock::new(),
-            confirmed: Mutex::new(None),
             denied: AtomicBool::new(false),
+            given_up: AtomicBool::new(false),
             requests: AtomicU64::new(0),
         })
     }
 
     /// One request, up to the header of its answer.
-    fn get(&self, name: &str, range: Option<&str>, left: Duration) -> Result<Response<ureq::Body>, Fault> {
+    fn get(&self, name: &str, range: Option<&str>, deadline: Instant) -> Result<Response<ureq::Body>, Fault> {
         self.requests.fetch_add(1, Ordering::Relaxed);
+        let left = deadline.saturating_duration_since(Instant::now()).max(Duration::from_millis(1));
         let silence = (self.limit / 3).min(left);
         let request = self.agent.get(format!("{}/{}", self.url, encoded(name))).config();
         let request = request.timeout_global(Some(left)).timeout_per_read(Some(silence)).timeout_recv_response(Some(silence));
-        let mut request = request.timeout_connect(Some(silence.min(Duration::from_secs(10)))).build();
+        let mut request = request.timeout_resolve(Some(silence)).timeout_connect(Some(silence.min(Duration::from_secs(10))));
+        if self.local {
+            // A proxy would be another machine, which might even be sent a credential unencrypted.
+            request = request.proxy(None);
+        }
+        let mut request = request.build();
         for (header, value) in [("Range", range), ("Authorization", self.authorization.as_deref())] {
             if let Some(value) = value {
                 request = request.header(header, value);
@@ -155,24 +179,25 @@ impl HttpParts {
     }
 
     /// One try to read a part.
-    fn attempt(&self, name: &str, span: Span, most: u64, left: Duration) -> Result<Option<Vec<u8>>, Fault> {
+    fn attempt(&self, name: &str, span: Span, most: u64, deadline: Instant) -> Result<Option<Vec<u8>>, Fault> {
         let range = match span {
             Span::All => None,
             Span::Last(bytes) => Some(format!("bytes=-{bytes}")),
             Span::From(start, bytes) => Some(format!("bytes={start}-{}", start + bytes - 1)),
         };
-        let mut response = self.get(name, range.as_deref(), left)?;
+        let mut response = self.get(name, range.as_deref(), deadline)?;
         let status = response.status().as_u16();
         let header = |name: &str| response.headers().get(name).and_then(|value| value.to_str().ok());
         match status {
             200 | 206 => {}
             _ => {
-                let pause = header("retry-after").and_then(|text| text.parse().ok()).map(Duration::from_secs);
+                let pause = retry_after(&response);
                 drain(&mut response);
-                return self.refusal(name, status, pause, left);
+                return self.refusal(name, status, pause);
             }
         }
-        if let Some(coding) = header("content-encoding").filter(|coding| *coding != "identity") {
+        let plain = |coding: &str| coding.is_empty() || coding.eq_ignore_ascii_case("identity");
+        if let Some(coding) = header("content-encoding").map(str::trim).filter(|coding| !plain(coding)) {
             let coding: String = coding.chars().take(40).collect();
             return Err(Fault::Lasting(format!("it is sent with the coding {coding:?}, though none was asked for")));
         }
@@ -232,39 +257,44 @@ impl HttpParts {
     }
 
     /// What an answer without the part means.
-    fn refusal(&self, name: &str, status: u16, pause: Option<Duration>, left: Duration) -> Result<Option<Vec<u8>>, Fault> {
-        let own = name.rsplit('/').next().unwrap_or_default();
+    fn refusal(&self, name: &str, status: u16, pause: Option<Duration>) -> Result<Option<Vec<u8>>, Fault> {
         match status {
             404 | 410 => Ok(None),
             // Object stores that are not to be listed answer so for a part that is not there.
-            403 if METADATA.contains(&own) => {
-                self.denied.store(true, Ordering::Relaxed);
+            403 => {
+                if describes(name) {
+                    self.denied.store(true, Ordering::Relaxed);
+                }
                 Ok(None)
             }
-            403 if self.may_read(left)? => Ok(None),
-            401 | 403 => Err(Fault::Lasting(format!(
-                "status {status}: its server asks for credentials; {AUTHORIZATION}=\"HOST VALUE\" sets the header `Authorization` for a host"
-            ))),
-            416 => Err(Fault::Lasting("it is shorter than the range that is needed (status 416)".into())),
-            408 | 425 | 429 | 500..=599 => Err(Fault::Passing(format!("status {status}"), pause.map(|pause| pause.min(MAX_PAUSE)))),
-            _ => Err(Fault::Lasting(format!("status {status}; accepted are 200, 206 and, if it is not stored, 404"))),
+            _ => Err(refused(status, pause)),
         }
     }
 
-    /// Whether what was read before may be read still. Without this, an access that ends would turn all values into missing ones.
-    fn may_read(&self, left: Duration) -> Result<bool, Fault> {
-        let Some(known) = self.known.get() else { return Ok(false) };
-        let mut confirmed = self.confirmed.lock().unwrap_or_else(PoisonError::into_inner);
-        if confirmed.is_none_or(|at| at.elapsed() > CONFIRMED) {
-            let mut response = self.get(known, Some("bytes=0-0"), left)?;
-            match response.status().as_u16() {
-                200 | 206 => *confirmed = Some(Instant::now()),
-                status @ (408 | 429 | 500..=599) => return Err(Fault::Passing(format!("status {status}"), None)),
-                _ => *confirmed = None,
+    /// Tries until one succeeds or fails for good, or the tries or their time are used up.
+    fn tried<T>(&self, name: &str, limit: Duration, attempt: impl Fn(Instant) -> Result<T, Fault>) -> Result<T, String> {
+        let begin = Instant::now();
+        let mut pause = PAUSE;
+        let mut tries = 0;
+        loop {
+            tries += 1;
+            let (what, asked) = match attempt(begin + limit) {
+                Ok(found) => return Ok(found),
+                Err(Fault::Lasting(what)) => return Err(what),
+                Err(Fault::Passing(what, asked)) => (what, asked),
+            };
+            let next = asked.map_or(pause, |asked| asked.max(pause));
+            pause *= 4;
+            let given_up = || self.given_up.load(Ordering::Relaxed);
+            if tries == TRIES || begin.elapsed() + next >= limit || given_up() {
+                return Err(format!("{what} ({tries} tries in {:.1} s)", begin.elapsed().as_secs_f64()));
             }
-            drain(&mut response);
+            tracing::debug!("{}: `{name}`: {what}; trying again in {:.1} s", self.url, next.as_secs_f64());
+            std::thread::sleep(next);
+            if given_up() {
+                return Err(what);
+            }
         }
-        Ok(confirmed.is_some())
     }
 }
 
@@ -284,33 +314,30 @@ impl Parts for HttpParts {
             Span::Last(0) | Span::From(_, 0) => return Ok(Some(Vec::new())),
             _ => {}
         }
-        let described = METADATA.contains(&name.rsplit('/').next().unwrap_or_default());
+        let described = describes(name);
         let limit = if described { self.limit.min(METADATA_LIMIT) } else { self.limit + Duration::from_secs(wanted / SLOWEST) };
-        let begin = Instant::now();
-        let mut pause = PAUSE;
-        let mut tries = 0;
-        loop {
-            tries += 1;
-            let left = limit.saturating_sub(begin.elapsed()).max(Duration::from_millis(1));
-            let (what, asked) = match self.attempt(name, span, most, left) {
-                Ok(data) => {
-                    if described && data.is_some() {
-                        // The first counts.
-                        let _ = self.known.set(name.to_owned());
-                    }
-                    return Ok(data);
-                }
-                Err(Fault::Lasting(what)) => return Err(what),
-                Err(Fault::Passing(what, asked)) => (what, asked),
-            };
-            let next = asked.map_or(pause, |asked| asked.max(pause));
-            pause *= 4;
-            if tries == TRIES || begin.elapsed() + next >= limit {
-                return Err(format!("{what} ({tries} tries in {:.1} s)", begin.elapsed().as_secs_f64()));
-            }
-            tracing::debug!("{}: `{name}`: {what}; trying again in {:.1} s", self.url, next.as_secs_f64());
-            std::thread::sleep(next);
+        let data = self.tried(name, limit, |deadline| self.attempt(name, span, most, deadline))?;
+        if described && data.is_some() {
+            // The first counts.
+            let _ = self.known.set(name.to_owned());
         }
+        Ok(data)
+    }
+
+    /// Asks for the first byte of metadata that were read before.
+    fn confirm(&self) -> Result<(), String> {
+        let Some(known) = self.known.get() else { return Err("its metadata were not read".into()) };
+        let asked = self.tried(known, self.limit.min(METADATA_LIMIT), |deadline| {
+            let mut response = self.get(known, Some("bytes=0-0"), deadline)?;
+            let (status, pause) = (response.status().as_u16(), retry_after(&response));
+            drain(&mut response);
+            if [200, 206].contains(&status) { Ok(()) } else { Err(refused(status, pause)) }
+        });
+        asked.map_err(|what| format!("`{known}`: {what}"))
+    }
+
+    fn give_up(&self, given_up: bool) {
+        self.given_up.store(given_up, Ordering::Relaxed);
     }
 
     fn folders(&self, _: &str) -> Result<Vec<String>, String> {
@@ -345,18 +372,16 @@ fn is_https(url: &str) -> bool {
 
 /// The value of the header for the host of a URL, if it is set for this host.
 fn authorization(url: &str, text: &str) -> Result<Option<String>, String> {
-    let authority = url.split("://").nth(1).and_then(|rest| rest.split('/').next()).unwrap_or_default();
     let (host, value) = text
         .split_once(' ')
         .filter(|(host, value)| !host.is_empty() && !value.trim().is_empty() && value.bytes().all(|b| (b' '..=b'~').contains(&b)))
         .ok_or_else(|| {
             format!("{AUTHORIZATION} is not understood; accepted is \"HOST VALUE\", such as \"data.example.org Bearer TOKEN\"")
         })?;
-    if !host.eq_ignore_ascii_case(authority) {
+    if !host.eq_ignore_ascii_case(authority(url)) {
         return Ok(None);
     }
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-    if !is_https(url) && !["localhost", "127.0.0.1", "[::1]"].contains(&name) {
+    if !is_https(url) && !is_local(host_and_port(host).0) {
         return Err(format!("{AUTHORIZATION} is set for {host}, but its URL would send it unencrypted; accepted is `https`"));
     }
     Ok(Some(value.trim().to_owned()))
@@ -375,6 +400,7 @@ fn agent(https: bool) -> Result<&'static Agent, String> {
             .http_status_as_error(false)
             .https_only(https)
             .max_redirects(REDIRECTS)
+            .redirect_auth_headers(RedirectAuthHeaders::Never)
             .max_idle_connections(2 * CONNECTIONS)
             .max_idle_connections_per_host(CONNECTIONS)
             .user_agent(concat!("ridgewatch/", env!("CARGO_PKG_VERSION")))
@@ -400,7 +426,8 @@ fn certificates(path: &Path) -> Result<RootCerts, String> {
 
 /// A name of a part as the path of a URL.
 fn encoded(name: &str) -> String {
-    let kept = |byte: u8| byte.is_ascii_alphanumeric() || b"/-._~!$&'()*+,;=:@".contains(&byte);
+    // Other characters may stand in a path too, but some object stores read `+` as a space.
+    let kept = |byte: u8| byte.is_ascii_alphanumeric() || b"/-._~".contains(&byte);
     name.bytes().map(|byte| if kept(byte) { char::from(byte).to_string() } else { format!("%{byte:02X}") }).collect()
 }
 
@@ -437,6 +464,30 @@ fn drain(response: &mut Response<ureq::Body>) {
     let _ = std::io::copy(&mut response.body_mut().as_reader().take(ERROR_BYTES), &mut std::io::sink());
 }
 
+/// Whether a part holds metadata.
+fn describes(name: &str) -> bool {
+    METADATA.contains(&name.rsplit('/').next().unwrap_or_default())
+}
+
+/// The pause that an answer asks for.
+fn retry_after(response: &Response<ureq::Body>) -> Option<Duration> {
+    let text = response.headers().get("retry-after")?.to_str().ok()?;
+    text.trim().parse().ok().map(|seconds| Duration::from_secs(seconds).min(MAX_PAUSE))
+}
+
+/// The fault of an answer that neither holds a part nor says that there is none.
+fn refused(status: u16, pause: Option<Duration>) -> Fault {
+    match status {
+        401 | 403 => Fault::Lasting(format!(
+            "status {status}: its server asks for credentials; {AUTHORIZATION}=\"HOST VALUE\" sets the header `Authorization` for a host"
+        )),
+        404 | 410 => Fault::Lasting(format!("status {status}")),
+        416 => Fault::Lasting("it is shorter than the range that is needed (status 416)".into()),
+        408 | 425 | 429 | 500..=599 => Fault::Passing(format!("status {status}"), pause),
+        _ => Fault::Lasting(format!("status {status}; accepted are 200, 206 and, if it is not stored, 404")),
+    }
+}
+
 fn too_long(bytes: u64, most: u64) -> String {
     format!("it holds {bytes} bytes, more than the {most} that are accepted here")
 }
@@ -458,6 +509,10 @@ fn fault(error: &ureq::Error) -> Fault {
         Error::TooManyRedirects => Fault::Lasting(format!("it is redirected more than {REDIRECTS} times")),
         Error::RequireHttpsOnly(_) => Fault::Lasting("it is redirected from https to http, which is not followed".into()),
         Error::BadUri(_) | Error::Http(_) => Fault::Lasting("its URL, or one that it is redirected to, is not understood".into()),
+        // Its text holds the header. The type within is of a crate that is not named here.
+        Error::Protocol(_) if text.contains("location header") => {
+            Fault::Lasting("it is redirected, but the header `Location` is missing or not understood".into())
+        }
         Error::ConnectProxyFailed(_) => Fault::Passing("the proxy does not connect".into(), None),
         Error::Timeout(kind) => Fault::Passing(format!("no answer in time ({kind})"), None),
         Error::Tls(_) | Error::Rustls(_) | Error::Pem(_) => Fault::Lasting(untrusted(&text)),
@@ -511,7 +566,12 @@ mod tests {
         assert_eq!((of("https://data.org.evil/x"), of("https://data.org:8443/x")), (Ok(None), Ok(None)));
         let said = of("http://data.org/x").unwrap_err();
         assert!(said.contains("unencrypted") && !said.contains("abc"), "{said}");
-        assert_eq!(authorization("http://127.0.0.1:9/x", "127.0.0.1:9 a"), Ok(Some("a".into())));
+        for host in ["127.0.0.1:9", "127.0.0.1", "[::1]:9", "[::1]", "localhost", "LOCALHOST:9"] {
+            assert_eq!(authorization(&format!("http://{host}/x"), &format!("{host} a")), Ok(Some("a".into())), "{host}");
+        }
+        for host in ["[::2]", "[fe80::1]:9", "localhost.evil", "127.0.0.1.evil:9", "127.evil"] {
+            assert!(authorization(&format!("http://{host}/x"), &format!("{host} a")).is_err(), "{host}");
+        }
         for odd in ["abc", " abc", "data.org ", "data.org a\nb"] {
             assert!(authorization("https://data.org/x", odd).is_err_and(|said| !said.contains("abc")), "{odd:?}");
         }
@@ -520,6 +580,7 @@ mod tests {
     #[test]
     fn names_and_ranges_are_written_as_http_has_them() {
         assert_eq!(encoded("a b/ü?#%/0.0"), "a%20b/%C3%BC%3F%23%25/0.0");
+        assert_eq!(encoded("u+v/c@1/0=0&!$'(),*;:-._~"), "u%2Bv/c%401/0%3D0%26%21%24%27%28%29%2C%2A%3B%3A-._~");
         assert_eq!(content_range("bytes 5-9/20"), Some((5, 9, Some(20))));
         assert_eq!(content_range("bytes 5-9/*"), Some((5, 9, None)));
         for odd in ["", "bytes */20", "bytes 9-5/20", "items 5-9/20", "bytes 5-/20"] {

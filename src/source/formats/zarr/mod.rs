@@ -58,8 +58,10 @@ pub struct ZarrStore {
     /// In the order of the listing.
     arrays: Vec<(String, Array)>,
     cache: RefCell<Cache>,
-    /// Bytes for parts that are asked for at once.
+    /// Bytes for parts that are asked for at once, and again for the indices of shards that are needed for them.
     at_once: u64,
+    /// A part that was not found in the request that is under way.
+    absent: RefCell<Option<String>>,
     /// Parts read, their bytes, and chunks unpacked.
     counts: Cell<[u64; 3]>,
     /// Bytes of the values that were asked for, unpacked.
@@ -135,7 +137,8 @@ impl ZarrStore {
         let cache = RefCell::new(Cache::new(limits.memory / CACHE_SHARE));
         let at_once = limits.memory / AT_ONCE_SHARE;
         let (counts, needed) = (Cell::default(), Cell::default());
-        Ok((listing, Self { path: path.into(), parts, arrays, cache, at_once, counts, needed }, chunks))
+        let absent = RefCell::default();
+        Ok((listing, Self { path: path.into(), parts, arrays, cache, at_once, absent, counts, needed }, chunks))
     }
 
     /// Reads parts of the store and hands each on as it comes, in any order. Behind a network, several are on their way at once.
@@ -147,9 +150,14 @@ impl ZarrStore {
     ) -> Result<(), String> {
         let mut hand = |place: usize, read: Result<Option<Vec<u8>>, String>| {
             let data = read.map_err(|what| format!("`{}`: {what}", wanted[place].0))?;
-            if let Some(data) = &data {
-                let [parts, bytes, unpacked] = self.counts.get();
-                self.counts.set([parts + 1, bytes + data.len() as u64, unpacked]);
+            match &data {
+                Some(data) => {
+                    let [parts, bytes, unpacked] = self.counts.get();
+                    self.counts.set([parts + 1, bytes + data.len() as u64, unpacked]);
+                }
+                None => {
+                    self.absent.borrow_mut().get_or_insert_with(|| wanted[place].0.clone());
+                }
             }
             each(place, data)
         };
@@ -158,7 +166,7 @@ impl ZarrStore {
         if room.min(wanted.len()) < 2 {
             return wanted.iter().enumerate().try_for_each(|(place, (name, span))| hand(place, parts.read(name, *span, most)));
         }
-        std::thread::scope(|scope| {
+        let read: Result<(), String> = std::thread::scope(|scope| {
             let (sender, receiver) = sync_channel(1);
             for _ in 0..room.min(wanted.len()) {
                 let (sender, next) = (sender.clone(), &next);
@@ -176,8 +184,23 @@ impl ZarrStore {
                 started.map_err(|e| format!("no thread to read it: {e}"))?;
             }
             drop(sender);
-            receiver.into_iter().try_for_each(|(place, read)| hand(place, read))
-        })
+            let read = receiver.into_iter().try_for_each(|(place, read)| hand(place, read));
+            // The threads end before this scope: not with all the tries that they have left.
+            parts.give_up(read.is_err());
+            read
+        });
+        parts.give_up(false);
+        read
+    }
+
+    /// Makes sure that what was not found in this request is not stored: a store that was moved, or may not be read any more, would turn
+    /// all values into missing ones. One look after the last answer serves for all of them.
+    fn confirm(&self) -> Result<(), String> {
+        let Some(name) = self.absent.take() else { return Ok(()) };
+        let unsure = |what: String| format!("`{name}`: it was not found, but neither can the metadata of its store be read now: {what}");
+        self.parts.confirm().map_err(unsure)?;
+        self.cache.borrow_mut().confirm();
+        Ok(())
     }
 
     fn unpack(&self, name: &str, steps: &[codecs::Step], data: Vec<u8>, bytes: u64) -> Result<Arc<Vec<u8>>, String> {
@@ -289,6 +312,7 @@ impl ZarrStore {
             return Err(format!("{needed} chunks would have to be read at once; accepted are {MAX_CHUNKS}"));
         }
         self.cache.borrow_mut().begin(variable, start, count);
+        *self.absent.borrow_mut() = None;
         out.resize(count.iter().product(), array.fill);
         let strides = strides(block, &codecs.order);
         let rows = strides_of(count);
@@ -308,16 +332,30 @@ impl ZarrStore {
             let elements = Elements { data, number: array.stored, big_endian: codecs.big_endian };
             elements.copy(from, &strides, &extents, &mut out[to..], &rows);
         };
-        let (mut number, mut places) = (vec![0; rank], Vec::new());
+        let index_bytes = array.index_bytes();
+        let shard = |place: &[usize]| -> Vec<usize> { (0..rank).map(|k| place[k] * block[k] / array.chunk[k]).collect() };
+        let (mut number, mut shards) = (vec![0; rank], BTreeSet::new());
+        let mut places: Vec<Vec<usize>> = Vec::new();
         loop {
-            places.push((0..rank).map(|k| first[k] + number[k]).collect());
+            let place: Vec<usize> = (0..rank).map(|k| first[k] + number[k]).collect();
+            if index_bytes > 0 && shards.insert(shard(&place)) {
+                // The indices of a batch are in memory together. One of them has to be.
+                let bytes = index_bytes.saturating_mul(shards.len() as u64);
+                if shards.len() > 1 && bytes > self.at_once {
+                    self.blocks(variable, codecs, &places, keep, &mut copy)?;
+                    places.clear();
+                    shards = BTreeSet::from([shard(&place)]);
+                }
+            }
+            places.push(place);
             let more = advance(&mut number, &blocks);
             if !more || !remote || places.len() == BATCH {
                 self.blocks(variable, codecs, &places, keep, &mut copy)?;
                 places.clear();
+                shards.clear();
             }
             if !more {
-                return Ok(());
+                return self.confirm();
             }
         }
     }
@@ -610,5 +648,52 @@ mod tests {
         assert!(unpacked <= 48 && bytes <= 2 * all, "{unpacked} {bytes}");
         // Without room, each time reads all of its chunks.
         assert_eq!(replayed(folder.path(), 0, 4), [96, 4 * all, 96]);
+    }
+
+    /// A folder of which two parts are read at once, and the indices that were read.
+    struct Apart(FolderParts, Arc<AtomicUsize>);
+
+    impl Parts for Apart {
+        fn read(&self, name: &str, span: Span, most: u64) -> Result<Option<Vec<u8>>, String> {
+            self.1.fetch_add(usize::from(matches!(span, Span::Last(_))), Ordering::Relaxed);
+            self.0.read(name, span, most)
+        }
+
+        fn folders(&self, name: &str) -> Result<Vec<String>, String> {
+            self.0.folders(name)
+        }
+
+        fn at_once(&self) -> usize {
+            2
+        }
+    }
+
+    #[test]
+    fn the_indices_of_a_batch_are_bounded() {
+        let folder = tempfile::tempdir().unwrap();
+        let array = r#"{"shape": [4, 8], "data_type": "int32", "node_type": "array", "zarr_format": 3, "fill_value": 0,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2, 2]}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "codecs": [{"name": "sharding_indexed", "configuration": {"chunk_shape": [1, 1],
+                "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}],
+                "index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]}}]}"#;
+        std::fs::write(folder.path().join("zarr.json"), array).unwrap();
+        for (y, x) in (0..8i32).map(|i| (i / 4, i % 4)) {
+            let values = (0..4i32).flat_map(|i| ((2 * y + i / 2) * 8 + 2 * x + i % 2).to_le_bytes());
+            let index = (0..4u64).flat_map(|i| [4 * i, 4]).flat_map(u64::to_le_bytes);
+            std::fs::create_dir_all(folder.path().join(format!("c/{y}"))).unwrap();
+            std::fs::write(folder.path().join(format!("c/{y}/{x}")), values.chain(index).collect::<Vec<u8>>()).unwrap();
+        }
+        // Each of the 8 shards once; or, with room for two indices, each of a row's 4 shards in each of the 4 rows; or one by one.
+        for (room, expected) in [(u64::MAX, 8), (2 * 64, 16), (1, 16)] {
+            let (listing, mut store, _) = ZarrStore::open_folder(folder.path(), &Limits::NONE).unwrap();
+            let count = Arc::new(AtomicUsize::new(0));
+            store.parts = Box::new(Apart(FolderParts::open(folder.path(), &Limits::NONE).unwrap(), count.clone()));
+            (store.cache, store.at_once) = (RefCell::new(Cache::new(0)), room);
+            let mut out = Vec::new();
+            store.read(0, &listing.variables[0], &[0, 0], &[4, 8], &mut out).unwrap();
+            assert!(out.into_iter().eq((0..32i32).map(f64::from)), "{room}");
+            assert_eq!(count.load(Ordering::Relaxed), expected, "{room}");
+        }
     }
 }

@@ -63,6 +63,17 @@ pub trait Parts: Send + Sync {
         1
     }
 
+    /// Looks whether the store may be read still: else a part that was not found before this call may be stored all the same.
+    ///
+    /// # Errors
+    /// It cannot be read, and why.
+    fn confirm(&self) -> Result<(), String> {
+        Ok(())
+    }
+
+    /// Says whether reads that are under way shall end instead of being tried again.
+    fn give_up(&self, _: bool) {}
+
     /// Whether metadata may be there, but not for this reader.
     fn denied(&self) -> bool {
         false
