@@ -235,7 +235,7 @@ pub(super) fn explained(scene: &SceneFile, error: MapError) -> anyhow::Error {
         MapError::Run(error) => located(scene, error, RunError::refused),
         MapError::Both { tau, error } => located(scene, error, RunError::refused)
             .context(format!("--both needs data over twice tau (tau = {tau}); accepted: a shorter --tau")),
-        error @ (MapError::AllMissing(_) | MapError::Draw(_)) => anyhow!(error),
+        error @ (MapError::Stopped | MapError::AllMissing(_) | MapError::Draw(_)) => anyhow!(error),
     }
 }
 
