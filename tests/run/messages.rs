@@ -183,7 +183,10 @@ fn lost_pictures_are_a_failure() {
         (outcome.status, outcome.stdout + &outcome.stderr)
     };
     let (status, said) = replay("");
-    assert!(status == Some(1) && said.contains("run/frames: 0 of 2 pictures written (2 failed: File too large"), "{status:?} {said}");
+    assert!(
+        status == Some(1) && said.contains("run/frames: 0 of 2 pictures written (2 failed, and 2 maps: File too large"),
+        "{status:?} {said}"
+    );
     assert!(!said.contains("frames in run/frames"), "{said}");
     let (status, said) = replay("--json");
     assert!(status == Some(1) && said.contains("0 of 2 pictures written"), "{status:?} {said}");
