@@ -39,7 +39,7 @@ const MAX_CERTIFICATES: u64 = 16 << 20;
 /// What is accepted of URLs, for messages.
 pub const ACCEPTED_URLS: &str = "URLs of Zarr stores, such as `https://HOST/PATH/x.zarr`";
 
-/// Whether a path is a URL. [`checked_url`] says whether it is accepted.
+/// Whether a path is a URL. `checked_url` says whether it is accepted.
 pub fn is_url(path: &Path) -> bool {
     let scheme = path.to_str().and_then(|text| text.split_once("://")).map_or("", |(scheme, _)| scheme);
     !scheme.is_empty() && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"+-.".contains(&byte))
