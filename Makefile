@@ -113,7 +113,7 @@ test: packages python-packages
 	  echo "NOT RUN: the tests of the NumPy reader of networks, since NumPy could not be fetched (needs the network)"; fi
 
 test-data: packages .venv/installed
-	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive -- --ignored --nocapture
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive -- --ignored --nocapture --skip far_away
 
 test-reader: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test network_reader -- --ignored
@@ -155,6 +155,7 @@ test-dashboard: packages
 	else cd $(DASHBOARD_TESTS) && CHROMIUM=$$(command -v chromium) RIDGEWATCH=$(CURDIR)/target/release/ridgewatch npm test; fi
 
 test-long: packages .venv/installed
+	$(CARGO) test --release --test archive far_away -- --ignored --nocapture
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test dashboard python -- --ignored
 	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-zmtp -- --ignored; else \
