@@ -7,7 +7,7 @@
 # make test-movies     tests films in MP4; installs ffmpeg if apt is available
 # make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
 # make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
-#                      with root also from another user, a Python client that steers, and `make fuzz`
+#                      with root also from another user, a Python client that steers, reading a store from far away, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
 # make adapters        builds the C library, the Fortran module and, if pip and the network are available, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver. The flags of the pkg-config file let

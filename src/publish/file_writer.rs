@@ -101,13 +101,19 @@ impl FileWriter {
         }
     }
 
+    /// The state. With [`WhenDiskSlow::Wait`], once fewer than [`MAX_PICTURES`] of their kind are queued, or after the limit.
+    fn with_place(&self, queued: impl Fn(&State) -> usize) -> MutexGuard<'_, State> {
+        let state = self.shared.lock();
+        if self.when_disk_slow == WhenDiskSlow::Drop {
+            return state;
+        }
+        let waited = self.shared.changed.wait_timeout_while(state, self.limit, |state| queued(state) >= MAX_PICTURES);
+        waited.unwrap_or_else(PoisonError::into_inner).0
+    }
+
     /// Queues a frame. With [`WhenDiskSlow::Wait`] it waits for a place in the queue, a minute at most.
     pub(super) fn frame(&self, frame: Frame) {
-        let mut state = self.shared.lock();
-        if self.when_disk_slow == WhenDiskSlow::Wait {
-            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.pictures >= MAX_PICTURES);
-            state = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
+        let mut state = self.with_place(|state| state.pictures);
         if state.pictures >= MAX_PICTURES {
             state.drop_oldest_pictures(self.when_disk_slow);
         }
@@ -126,11 +132,7 @@ impl FileWriter {
 
     /// Queues the map of a slide, whose frame was queued before. It waits for a place as a frame does; without one the map is left out.
     pub(super) fn map(&self, map: SlideMap) {
-        let mut state = self.shared.lock();
-        if self.when_disk_slow == WhenDiskSlow::Wait {
-            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.maps >= MAX_PICTURES);
-            state = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
+        let mut state = self.with_place(|state| state.maps);
         if state.maps >= MAX_PICTURES {
             match self.when_disk_slow {
                 WhenDiskSlow::Wait => state.statistics.maps_failed += 1,
@@ -225,17 +227,16 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
                         statistics.maps_written += 1;
                         statistics.bytes_written += bytes;
                     }
-                    Err(_) => statistics.maps_failed += 1,
-                }
-                if let Err(error) = written {
-                    let path = folder.path().display();
-                    if statistics.maps_failed == 1 {
-                        tracing::warn!(
-                            "{path}: the map of slide {} could not be written: {error}; the run continues and counts such maps",
-                            map.slide
-                        );
+                    Err(error) => {
+                        statistics.maps_failed += 1;
+                        if statistics.maps_failed == 1 {
+                            let (path, slide) = (folder.path().display(), map.slide);
+                            tracing::warn!(
+                                "{path}: the map of slide {slide} could not be written: {error}; the run continues and counts such maps"
+                            );
+                        }
+                        statistics.refused.get_or_insert_with(|| error.to_string());
                     }
-                    statistics.refused.get_or_insert_with(|| error.to_string());
                 }
                 continue;
             }

@@ -1,4 +1,5 @@
-//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `maps/slide_000000.png` and `.json`, `records.jsonl` (and `records-1.jsonl`), `summary.json`.
+//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `maps/slide_000000.png` and `.json`, `records.jsonl` (and `records-1.jsonl`),
+//! `summary.json`.
 
 use super::error::PublishError;
 use super::exr::encode_exr;
