@@ -200,14 +200,20 @@ fn bits(film: &Film) -> Vec<u32> {
 
 #[test]
 fn whole_frames_are_the_same_bits() {
-    for (point_light, cells) in [(false, None), (true, Some([5, 3, 7])), (false, Some([1, 1, 1]))] {
+    let cases = [(false, None, false), (true, Some([5, 3, 7]), false), (true, Some([5, 3, 7]), true), (false, Some([1, 1, 1]), false)];
+    for (point_light, cells, misled) in cases {
         let scene = scene(point_light, false, cells);
-        let mut reference = Renderer::new(scene.clone(), &domain(), 1.0).unwrap();
-        let mut renderer = Renderer::new(scene, &domain(), 1.0).unwrap();
-        // The first frame uses the largest majorants, later ones those from the values of earlier frames.
+        let mut reference = Renderer::new(scene, &domain(), 1.0).unwrap();
+        if misled {
+            coupled::mislead(&reference);
+        }
+        let mut renderer = reference.clone();
+        // The first frame uses the largest majorants, or those that are too low. Later ones have majorants from the values of earlier frames.
         for (frame, samples) in [(0, 0..3), (1, 0..1), (2, 4..9)] {
             let (expected, stats) = reference.render_samples(frame, samples.clone(), &mut Waves, None, &NEVER).unwrap();
-            let found = tracked(&mut renderer, frame, samples, 1, [1, 1]);
+            // Of what a flight has looked ahead to, nothing counts once it has met an extinction above its majorant.
+            let found = tracked(&mut renderer, frame, samples, 1, if misled { [4, 6] } else { [1, 1] });
+            assert!((stats.majorant_exceeded > 100) == (misled && frame == 0), "frame {frame}: {} exceeded", stats.majorant_exceeded);
             assert_eq!(
                 found.counts,
                 [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, 0],

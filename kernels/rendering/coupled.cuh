@@ -49,6 +49,7 @@ struct Coupled {
     bool flies[2];         // the field's camera flight goes on
     bool shines[2];        // the light ray belongs to the field
     bool in_shadow;
+    bool raised;           // a field was above the majorant
     float difference[3];
     float alpha;
     uint32_t pixel, sample, dimension;
@@ -153,7 +154,9 @@ RW_FN void collide(const FrameScene& scene, Coupled& path, const Collision& at, 
         RW_UNROLL
         for (int x = 0; x < 2; ++x) {
             if (!path.shines[x]) continue;
-            path.transmittance[x] *= 1.0f - extinction(scene.transfer, log_stretch[x] * scene.per_tau) / at.hit.majorant;
+            const float ratio = extinction(scene.transfer, log_stretch[x] * scene.per_tau) / at.hit.majorant;
+            path.raised |= ratio > 1.0f;
+            path.transmittance[x] *= 1.0f - ratio;
             size = fmaxf(size, fabsf(path.transmittance[x]));
         }
         if (size >= roulette_below) return;
@@ -173,6 +176,7 @@ RW_FN void collide(const FrameScene& scene, Coupled& path, const Collision& at, 
         if (!path.flies[x]) continue;
         const float ftle = log_stretch[x] * scene.per_tau;
         const float ratio = extinction(scene.transfer, ftle) / at.hit.majorant;
+        path.raised |= ratio > 1.0f;
         const float real = ratio <= 1.0f ? ratio : ratio / (2.0f * ratio - 1.0f);
         if (at.decision >= real) {
             if (ratio > 1.0f) path.weight[x] *= 1.0f - 2.0f * ratio;
@@ -228,7 +232,8 @@ RW_FN bool fly_on(const CoupledFrame& frame, Coupled& path, const Record& known,
         path.dimension += 1;
         // 1 - u lies in (0, 1].
         const float depth = -logf(1.0f - unit(random.w[0]));
-        if (!walk(scene.box, frame.grid.majorants, path.way.origin, path.way.direction, path.way.t, path.way.end, depth, at.hit)) {
+        const float least = least_majorant(scene, path.raised);
+        if (!walk(scene.box, frame.grid.majorants, least, path.way.origin, path.way.direction, path.way.t, path.way.end, depth, at.hit)) {
             if (path.in_shadow) {
                 end_shadow(path);
                 continue;
@@ -275,7 +280,7 @@ struct CoupledSlots {
     Float4* colour;        // of f, and red of s
     Float2* colour_rest;   // green and blue of s
     Float4* found;         // difference, alpha
-    Uint4* progress;       // dimension, sample and (in the upper five bits) flags, first record, nothing
+    Uint4* progress;       // dimension, sample and (in the upper five bits) flags, first record, `raised`
 };
 static_assert(sizeof(CoupledSlots) == 72, "layout");
 
@@ -291,6 +296,7 @@ RW_FN void load_path(const CoupledSlots& slots, uint32_t slot, Coupled& path, ui
     path.shines[S] = progress.y >> 30 & 1u;
     path.in_shadow = progress.y >> 31;
     first = progress.z;
+    path.raised = progress.w != 0;
     path.way = {{place.x, place.y, place.z}, {way.x, way.y, way.z}, place.w, way.w};
     path.weight[F] = factors.x, path.weight[S] = factors.y;
     path.transmittance[F] = factors.z, path.transmittance[S] = factors.w;
@@ -308,7 +314,7 @@ RW_FN void load_path(const CoupledSlots& slots, uint32_t slot, Coupled& path, ui
 RW_FN void store_path(const CoupledSlots& slots, uint32_t slot, const Coupled& path, uint32_t first) {
     const uint32_t flags = (path.flies[F] ? 1u : 0u) | (path.flies[S] ? 2u : 0u) | (path.shines[F] ? 4u : 0u) | (path.shines[S] ? 8u : 0u) |
                            (path.in_shadow ? 16u : 0u);
-    slots.progress[slot] = {path.dimension, path.sample | flags << 27, first, 0};
+    slots.progress[slot] = {path.dimension, path.sample | flags << 27, first, path.raised ? 1u : 0u};
     slots.place[slot] = {path.way.origin[0], path.way.origin[1], path.way.origin[2], path.way.t};
     slots.way[slot] = {path.way.direction[0], path.way.direction[1], path.way.direction[2], path.way.end};
     slots.factors[slot] = {path.weight[F], path.weight[S], path.transmittance[F], path.transmittance[S]};
@@ -382,7 +388,8 @@ RW_FN bool advance_coupled(const CoupledFrame& frame, const CoupledWork& work, c
         const Record record = queue.answered[first];
         const uint32_t cell = record.cell & ~SHADOW_CELL;
         const Words random = words(frame.scene.random, pixel, path.sample, path.dimension - 1);
-        at = {{record.t, frame.grid.majorants[cell], cell}, record.s, unit(random.w[1]), unit(random.w[2])};
+        const float majorant = fmaxf(frame.grid.majorants[cell], least_majorant(frame.scene, path.raised));
+        at = {{record.t, majorant, cell}, record.s, unit(random.w[1]), unit(random.w[2])};
         f = queue.log_stretch[first];
         by = queue.by[first];
         known_at = record.next;

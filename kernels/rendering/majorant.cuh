@@ -52,10 +52,10 @@ struct Hit {
     uint32_t cell;
 };
 
-// Walks from `t` along origin + t direction (grid coordinates) until the majorant's optical depth reaches `depth`. Returns false if that is
+// Walks from `t` along origin + t direction (grid coordinates) until the optical depth of the majorants, each at least `least`, reaches `depth`. Returns false if that is
 // beyond `end`. Visits at most as many cells as the grid has along its three axes together.
-RW_FN bool walk(const SceneBox& box, const float* majorants, const float origin[3], const float direction[3], float t, float end,
-                       float depth, Hit& hit) {
+RW_FN bool walk(const SceneBox& box, const float* majorants, float least, const float origin[3], const float direction[3], float t,
+                       float end, float depth, Hit& hit) {
     const int strides[3] = {1, box.cells[0], box.cells[0] * box.cells[1]};
     int index = 0;
     // Per axis: cells left before the walk leaves the grid, index step, t of the next wall, and t between walls.
@@ -83,7 +83,7 @@ RW_FN bool walk(const SceneBox& box, const float* majorants, const float origin[
         const float nearest = x ? wall[0] : (y ? wall[1] : wall[2]);
         const int remaining = x ? left[0] : (y ? left[1] : left[2]);
         const float stop = fminf(nearest, end);
-        const float majorant = majorants[index];
+        const float majorant = fmaxf(majorants[index], least);
         // Rounding may put a wall slightly before t.
         const float crossed = majorant * fmaxf(stop - t, 0.0f);
         if (crossed > depth) {

@@ -1,10 +1,11 @@
 // One path, by single scattering: the free flight from the camera by delta tracking (Woodcock et al. 1965), then the transmittance toward the
 // light by ratio tracking (Novak et al. 2014). States and random numbers equal those of `render::tracking`. Both walk the majorant grid and stop
 // at tentative collisions, at which the extinction is queried. If an extinction exceeds its majorant, the null-collision rate is negative;
-// events are then drawn in proportion to absolute rates and weighted (Galtier et al. 2013), which keeps the estimator unbiased.
+// events are then drawn in proportion to absolute rates and weighted (Galtier et al. 2013), which keeps the estimator unbiased. From there on the
+// path takes the largest extinction for its majorant.
 //
-// Positions of a flight's tentative collisions do not depend on the answers there; answers only decide how many of them the flight reaches. A
-// flight may therefore query several at once (`look_ahead`). Answers beyond its end are ignored.
+// Up to there, positions of a flight's tentative collisions do not depend on the answers; answers only decide how many of them the flight reaches.
+// A flight may therefore query several at once (`look_ahead`). Answers beyond its end, and those of the lower majorants, are ignored.
 #pragma once
 #include "rendering/camera.cuh"
 #include "rendering/film.cuh"
@@ -43,6 +44,7 @@ struct Flight {
     uint32_t sample;
     uint32_t dimension;  // of the next draw
     uint32_t stage;
+    bool raised;   // the path has met an extinction above its majorant
     PathSample path;  // contribution of the path at full transmittance
 };
 
@@ -70,6 +72,8 @@ struct Answer {
     unsigned char by;   // AnsweredBy
 };
 
+RW_FN float least_majorant(const FrameScene& scene, bool raised) { return raised ? scene.transfer.extinction_max : 0.0f; }
+
 RW_FN void flight_point(const Flight& flight, float t, float point[3]) {
     for (int k = 0; k < 3; ++k) point[k] = flight.origin[k] + t * flight.direction[k];
 }
@@ -87,7 +91,8 @@ RW_FN bool draw(const FrameScene& scene, const MajorantGrid& grid, const Flight&
     // 1 - u lies in (0, 1].
     const float depth = -logf(1.0f - unit(random.w[0]));
     place = unit(random.w[3]);
-    return walk(scene.box, grid.majorants, flight.origin, flight.direction, t, flight.end, depth, hit);
+    const float least = least_majorant(scene, flight.raised);
+    return walk(scene.box, grid.majorants, least, flight.origin, flight.direction, t, flight.end, depth, hit);
 }
 
 // Flies to the next tentative collision. Returns true if `hit` needs an answer, false if the path is over.
@@ -132,6 +137,7 @@ RW_FN bool start(const FrameScene& scene, const MajorantGrid& grid, uint32_t pix
     flight.sample = sample;
     flight.dimension = 1;
     flight.stage = CAMERA;
+    flight.raised = false;
     flight.weight = 1.0f;
     flight.t = 0.0f;
     flight.end = 0.0f;
@@ -189,7 +195,10 @@ RW_FN Verdict resolve(const FrameScene& scene, Flight& flight, const Hit& hit, A
     }
     const Words random = words(scene.random, flight.pixel, flight.sample, flight.dimension - 1);
     const float ratio = extinction(scene.transfer, ftle) / hit.majorant;
-    counts.exceeded += ratio > 1.0f ? 1 : 0;
+    if (ratio > 1.0f) {
+        counts.exceeded += 1;
+        flight.raised = true;
+    }
     if (flight.stage == CAMERA) {
         const float real = ratio <= 1.0f ? ratio : ratio / (2.0f * ratio - 1.0f);
         if (unit(random.w[1]) < real) {

@@ -29,7 +29,7 @@ struct Slots {
     Float4* place;     // origin, t
     Float4* way;       // direction, end
     Float4* colour;    // radiance, weight
-    Uint4* progress;   // sample, dimension and (in the upper two bits) stage, queries, traced
+    Uint4* progress;   // sample, dimension and (in the upper three bits) stage and `raised`, queries, traced
     Float2* seen;      // weight and weighted FTLE of the scattering event
     uint32_t* first;   // first pending collision in the queue
     double* sums;      // PIXEL_SUM_FIELDS arrays of `count` sums
@@ -58,7 +58,8 @@ RW_FN void load_flight(const Slots& slots, const Band& band, uint32_t slot, Flig
     flight.weight = colour.w;
     flight.pixel = band.first_pixel + slot % band.pixels;
     flight.sample = progress.x;
-    flight.dimension = progress.y & 0x3FFFFFFFu;
+    flight.dimension = progress.y & 0x1FFFFFFFu;
+    flight.raised = progress.y >> 29 & 1u;
     flight.stage = progress.y >> 30;
     flight.path.queries = progress.z;
     flight.path.traced = progress.w;
@@ -71,7 +72,8 @@ RW_FN void store_flight(const Slots& slots, uint32_t slot, const Flight& flight)
     slots.place[slot] = {flight.origin[0], flight.origin[1], flight.origin[2], flight.t};
     slots.way[slot] = {flight.direction[0], flight.direction[1], flight.direction[2], flight.end};
     slots.colour[slot] = {flight.path.radiance[0], flight.path.radiance[1], flight.path.radiance[2], flight.weight};
-    slots.progress[slot] = {flight.sample, flight.dimension | flight.stage << 30, flight.path.queries, flight.path.traced};
+    const uint32_t flags = flight.stage << 30 | (flight.raised ? 1u << 29 : 0u);
+    slots.progress[slot] = {flight.sample, flight.dimension | flags, flight.path.queries, flight.path.traced};
     slots.seen[slot] = {flight.path.scattered, flight.path.ftle};
 }
 
@@ -125,12 +127,13 @@ RW_FN bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watc
         load_flight(slots, band, slot, flight);
         uint32_t at = slots.first[slot];
         Verdict verdict;
+        const bool was_raised = flight.raised;
         for (;;) {
             const Float4 record = queue.answered[at];
             const Answer answer = {queue.log_stretch[at], queue.by[at]};
             verdict = resolve(scene, flight, Hit{record.x, record.y, float_bits(record.z)}, answer, watch, counts);
             const uint32_t next = float_bits(record.w);
-            if (verdict != NULL_COLLISION || next == NONE) break;
+            if (verdict != NULL_COLLISION || next == NONE || flight.raised != was_raised) break;
             at = next;
             flight.dimension += 1;
         }

@@ -3,7 +3,9 @@
 //!
 //! Both traverse the majorant grid by a digital differential analyser (Amanatides and Woo 1987) and stop at tentative collisions, which need
 //! the extinction there. If the extinction exceeds its majorant, the probability of a null collision is negative. The collision is then drawn
-//! in proportion to the absolute rates and carries a weight (Galtier et al. 2013), so that the estimate stays unbiased.
+//! in proportion to the absolute rates and carries a weight (Galtier et al. 2013), so that the estimate stays unbiased. From there on the path
+//! takes the largest extinction of all for its majorant: thinning stays exact if the rate depends on what was met before (Ogata 1981), and weights
+//! that multiplied from collision to collision would have no bound.
 
 use super::film::PathSample;
 use super::majorant::MajorantGrid;
@@ -94,6 +96,8 @@ pub struct Flight {
     end: f32,
     /// Camera stage: weight of the path. Shadow stage: transmittance so far.
     weight: f32,
+    /// Least majorant: 0, and the largest extinction once the path has met one above its majorant.
+    least_majorant: f32,
     /// Cell of the tentative collision and its majorant.
     cell: u32,
     majorant: f32,
@@ -124,6 +128,7 @@ impl Flight {
             t: 0.0,
             end: 0.0,
             weight: 1.0,
+            least_majorant: 0.0,
             cell: 0,
             majorant: 0.0,
             decision: 0.0,
@@ -160,7 +165,7 @@ impl Flight {
         self.roulette = unit(words[2]);
         // 1 - u lies in (0, 1].
         let depth = -(1.0 - unit(words[0])).ln();
-        match walk(scene.majorants, self.origin, self.direction, self.t, self.end, depth) {
+        match walk(scene.majorants, self.least_majorant, self.origin, self.direction, self.t, self.end, depth) {
             Some(hit) => {
                 (self.t, self.cell, self.majorant) = (hit.t, hit.cell, hit.majorant);
                 Outcome::Pending
@@ -212,7 +217,10 @@ impl Flight {
             return self.finish_unscattered(scene.background, 0.0);
         }
         let ratio = scene.transfer.extinction(ftle) / self.majorant;
-        *exceeded += u64::from(ratio > 1.0);
+        if ratio > 1.0 {
+            *exceeded += 1;
+            self.least_majorant = scene.transfer.extinction_max();
+        }
         match self.stage {
             Stage::Camera => {
                 let real = if ratio <= 1.0 { ratio } else { ratio / (2.0 * ratio - 1.0) };
@@ -267,10 +275,10 @@ pub struct Hit {
     pub majorant: f32,
 }
 
-/// Traverses the grid from `t` along `origin + t direction` until the majorants integrate to `depth`; `None` if that is
+/// Traverses the grid from `t` along `origin + t direction` until the majorants, each at least `least`, integrate to `depth`; `None` if that is
 /// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 #[inline]
-pub fn walk(grid: &MajorantGrid, origin: GridPoint, direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
+pub fn walk(grid: &MajorantGrid, least: f32, origin: GridPoint, direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
     let cells = grid.cells();
     let majorants = grid.majorants();
     let strides = [1, cells[0] as isize, (cells[0] * cells[1]) as isize];
@@ -299,7 +307,7 @@ pub fn walk(grid: &MajorantGrid, origin: GridPoint, direction: [f32; 3], mut t: 
             2
         };
         let stop = wall[axis].min(end);
-        let majorant = majorants[index as usize];
+        let majorant = majorants[index as usize].max(least);
         // Rounding may put a wall slightly before t.
         let crossed = majorant * (stop - t).max(0.0);
         if crossed > depth {

@@ -112,7 +112,7 @@ fn none_missing() -> Vec<u8> {
 }
 
 /// Teaches the majorants values that are too low.
-fn mislead(renderer: &Renderer) {
+pub fn mislead(renderer: &Renderer) {
     let mut random = uniform(12);
     let points: Vec<DomainPoint> = (0..20_000).map(|_| domain().from_unit(UnitPoint([random(), random(), random()]))).collect();
     renderer.observe(&points, &vec![0.6; points.len()]);
@@ -150,7 +150,8 @@ fn coupled_paths_are_the_same_bits() {
             let [queries, traced, missing, exceeded, ended, over_budget] = found.counts;
             assert_eq!((queries, traced), (total(|path| path.queries), total(|path| path.traced)));
             assert_eq!((u64::from(missing), ended, over_budget), (answers.1, 2 * list.len() as u32, 0));
-            assert!((exceeded > 10) == misled, "{exceeded} exceeded");
+            // Once the values of a round are known, few are above the majorants of the next.
+            assert!((exceeded > if pair == 0 { 100 } else { 0 }) == misled, "round {pair}: {exceeded} exceeded");
             let [differ, apart] = [0, 3].map(|k| found.found.iter().filter(|path| path[k] != 0.0).count());
             assert!(differ > 100 && apart > 10, "{differ} paths differ, {apart} scatter in one field alone");
             assert!(renderer.absorb(&found.seen));

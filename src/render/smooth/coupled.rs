@@ -3,7 +3,8 @@
 //! Both fields see the same tentative collisions, the same acceptance numbers and the same light rays, under one majorant, until one of them
 //! scatters where the other does not. The mean of the difference is the error of the surrogate's expected picture; its variance is small where
 //! the fields agree. This is a two-level estimator (Giles 2015) with delta and ratio tracking (see [`crate::render`]) as the path sampler. Each
-//! field has weights of its own where its extinction exceeds the majorant, so that the estimate stays unbiased.
+//! field has weights of its own where its extinction exceeds the majorant, so that the estimate stays unbiased; from there on the path takes the
+//! largest extinction for its majorant (see [`crate::tracking`]).
 
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
@@ -71,6 +72,8 @@ pub(super) struct CoupledFlight {
     shadow: Segment,
     in_shadow: bool,
     particles: [Particle; 2],
+    /// Least majorant: 0, and the largest extinction once a field was above the majorant.
+    least_majorant: f32,
     hit: Hit,
     decision: f32,
     roulette: f32,
@@ -95,6 +98,7 @@ impl CoupledFlight {
             shadow: Segment::default(),
             in_shadow: false,
             particles: [particle; 2],
+            least_majorant: 0.0,
             hit: Hit::default(),
             decision: 0.0,
             roulette: 0.0,
@@ -138,7 +142,7 @@ impl CoupledFlight {
             (self.decision, self.roulette) = (unit(words[1]), unit(words[2]));
             let depth = -(1.0 - unit(words[0])).ln();
             let Segment { origin, direction, t, end } = *self.segment();
-            match walk(scene.majorants, origin, direction, t, end, depth) {
+            match walk(scene.majorants, self.least_majorant, origin, direction, t, end, depth) {
                 Some(hit) => {
                     self.segment().t = hit.t;
                     self.hit = hit;
@@ -209,6 +213,9 @@ impl CoupledFlight {
         let ask = |x: usize| if x == TRACED { traced } else { medium.ftle(scene.space.unit_of_grid(grid)) };
         let ftle: [Option<f32>; 2] = std::array::from_fn(|x| if self.takes_part(x) { ask(x) } else { None });
         let ratio = ftle.map(|ftle| ftle.map(|ftle| scene.transfer.extinction(ftle) / self.hit.majorant));
+        if ratio.iter().flatten().any(|&ratio| ratio > 1.0) {
+            self.least_majorant = scene.transfer.extinction_max();
+        }
         if self.in_shadow {
             self.attenuate(ratio);
             return;
