@@ -52,7 +52,7 @@ fn opacity(film: &Film) -> (f64, f64) {
     (mean, (variance / n).sqrt())
 }
 
-/// Fails if the majorant is not raised by what exceeded it, and without the weights of collisions above it.
+/// Fails if neither the path nor the next frame raises a majorant that was exceeded, and without the weights of collisions above it.
 #[test]
 fn majorant_too_low() {
     const EXTINCTION: f64 = 5.0;
@@ -70,7 +70,7 @@ fn majorant_too_low() {
         })
     };
     let sweep: Vec<(f64, [((f64, f64), f64); 2])> =
-        [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9].map(|low| (low, frames(low))).to_vec();
+        [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95].map(|low| (low, frames(low))).to_vec();
     let clamped = |low: f64| 1.0 - (-EXTINCTION * RAMP * (1.0 - low)).exp() - truth;
     let usual = sweep[0].1[0].0.1;
     for (low, [((first, error), exceeded), ((second, error2), exceeded2)]) in &sweep {
@@ -84,21 +84,19 @@ fn majorant_too_low() {
         assert_eq!(*exceeded > 0.0, *low > 0.0, "what is above its majorant is counted");
         assert_eq!(*exceeded2, 0.0, "the next frame's majorant is raised");
         assert!((second - truth).abs() < 4.0 * error2 && *error2 < 1.5 * usual, "{low}: {second} +- {error2}");
-        if *low <= 0.5 {
-            assert!((first - truth).abs() < 4.0 * error, "weights leave no bias: {first} +- {error} of {truth}");
-            assert!(*low < 0.15 || 4.0 * error < 0.9 * clamped(*low).abs(), "and without them the test would see one: {low}");
-        }
+        assert!((first - truth).abs() < 4.0 * error, "weights leave no bias: {first} +- {error} of {truth}");
+        assert!(*low < 0.15 || 4.0 * error < 0.9 * clamped(*low).abs(), "and without them the test would see one: {low}");
+        // With a majorant that stays too low, weights multiply: 90 % too low, the noise of a frame is larger than the opacity.
+        assert!(*error < 0.05 * truth, "{low}: {error}");
     }
-    let fails = sweep.iter().find(|(_, [((_, error), _), _])| *error > 0.1 * truth).expect("weights fail in the end");
-    assert!((0.5..0.9).contains(&fails.0), "{fails:?}");
     let at = |low: f64| sweep.iter().find(|s| (s.0 - low).abs() < 1e-9).unwrap().1[0].0;
     let text: Vec<String> =
         [0.2, 0.5, 0.9].map(|low| format!("{:.0} % low {:+.3} ± {:.3}", 100.0 * low, at(low).0 - truth, at(low).1)).to_vec();
     row([
         "majorant too low",
-        &format!("{:.0} % too low: one frame's noise is above 10 %", 100.0 * fails.0),
+        &format!("not down to 95 % too low: one frame's noise is {:.1} % there", 100.0 * at(0.95).1 / truth),
         "`majorant_exceeded`",
-        "weights collisions (no bias), and raises the majorant for the next frame",
+        "weights collisions (no bias); the path takes the largest extinction from there on, the next frame raises the majorant",
         &format!(
             "opacity, first frame: {}; without weights {:+.2}, {:+.2}, {:+.2}; next frame ± {:.4}",
             text.join(", "),
