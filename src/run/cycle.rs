@@ -460,7 +460,7 @@ impl<'a> Run<'a> {
         if has_table && scene.surrogate.table_nodes.is_none() && scene.network.size != Size::Auto {
             let nodes = settings.nodes(&plan.domain)?;
             let because = match (fine, settings.table_nodes) {
-                (Some(_), nodes) if nodes == fine => {
+                (Some(fine), Some(nodes)) if nodes[..2] == fine[..2] => {
                     "two a pixel along the longest edge, since a flow of two dimensions folds finer than its data"
                 }
                 (_, Some(_)) => "those of the data, as far as they are bounded",
