@@ -33,13 +33,20 @@ pub struct Choice {
     pub device: String,
 }
 
-impl std::fmt::Display for Choice {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl Choice {
+    /// The times that decided.
+    pub fn why(&self) -> String {
         let time = |seconds: &Option<f64>| {
             seconds.filter(|seconds| seconds.is_finite()).map_or("never".to_owned(), |seconds| format!("{seconds:.2} s"))
         };
         let times: Vec<String> = self.seconds.iter().map(|(method, seconds)| format!("{} {}", method.name(), time(seconds))).collect();
-        write!(f, "render.method = \"auto\": {}, first to {} dB in a trial ({})", self.method.name(), self.target, times.join(", "))
+        format!("first to {} dB in a trial ({})", self.target, times.join(", "))
+    }
+}
+
+impl std::fmt::Display for Choice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "render.method = \"auto\": {}, {}", self.method.name(), self.why())
     }
 }
 

@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{RunError, Setup};
+use ridgewatch::run::{Decision, RunError, Setup};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -99,15 +99,16 @@ pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
 }
 
 /// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene and data on the same
-/// device.
-pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<()> {
+/// device. Returns the decision; `None` if the scene names a method.
+pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<Option<Decision>> {
     if scene.render.method != Method::Auto {
-        return Ok(());
+        return Ok(None);
     }
     if scene.render.until.is_some() || scene.render.budget.is_some() {
         scene.render.method = Method::TwoLevel;
-        messages::note("render.method = \"auto\": two_level, since only smooth methods have render.until and render.budget");
-        return Ok(());
+        let why = "only smooth methods have render.until and render.budget";
+        messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
+        return Ok(Some(Decision::new("render.method", "two_level", why)));
     }
     let files = if scene.archive.files.is_empty() {
         Vec::new()
@@ -143,7 +144,7 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
     };
     messages::note(&choice);
     scene.render.method = choice.method;
-    Ok(())
+    Ok(Some(Decision::new("render.method", choice.method.name(), choice.why())))
 }
 
 /// File beside a scene file with the choice of `render.method = "auto"`.

@@ -144,7 +144,7 @@ struct Convergence {
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
     let faulty = |error| located(&scene, error, RunError::refused);
-    let Setup { plan, mut slides, notes } = open(&scene)?;
+    let Setup { plan, mut slides, notes, .. } = open(&scene)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
         check_folder(out)?;

@@ -20,7 +20,11 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
     options.run.apply(&mut scene)?;
     let device = device(common, &scene)?;
-    settle_method(common, &mut scene, &options.paths, &device)?;
+    let method = settle_method(common, &mut scene, &options.paths, &device)?;
     let text = scene.to_toml()?;
-    Session { common, options: &options.run, scene, text, follows: None }.run(|scene, _| open(scene).map(Some))
+    Session { common, options: &options.run, scene, text, follows: None }.run(|scene, _| {
+        let mut setup = open(scene)?;
+        setup.decisions.extend(method);
+        Ok(Some(setup))
+    })
 }

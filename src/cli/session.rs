@@ -436,6 +436,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "integration_residual": report.integration_residual,
         "transfer": report.transfer,
         "surrogate_bytes": report.surrogate_bytes,
+        "decisions": report.decisions,
         "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
         "checkpoints": report.checkpoints,

@@ -6,6 +6,7 @@
 
 use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
+use super::decision::Decision;
 use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
@@ -23,7 +24,9 @@ use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer,
 use crate::progress;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderError, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
-use crate::surrogate::{CheckpointError, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
+use crate::surrogate::{
+    CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
+};
 use crate::trust::TrustMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -106,6 +109,8 @@ pub struct RunReport {
     pub transfer: Option<TransferRecord>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
+    /// What was chosen for settings that the scene leaves open: one entry a setting, the last choice for it.
+    pub decisions: Vec<Decision>,
     /// Changes of its size with `size = "auto"`, with reasons; a few dozen at most, since no rejected size is tried twice.
     pub sizes: Vec<String>,
     /// Resolution of the snapshots in time; `None` for closed forms.
@@ -318,7 +323,8 @@ fn drive<B: Backend>(
     report: &mut RunReport,
 ) -> Result<(), RunEnd> {
     let began = Instant::now();
-    let Setup { plan, mut slides, notes } = setup;
+    let Setup { plan, mut slides, notes, decisions } = setup;
+    report.decisions = decisions;
     let time = &plan.scene.time;
     let planned = slides.expected().filter(|_| plan.scene.render.until.is_none());
     let frames = planned.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
@@ -354,8 +360,13 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
+    for decision in &run.report.decisions {
+        tracing::info!("{decision}");
+    }
     let mut cycle = Cycle { run, session, map, settled: None };
-    cycle.run.report.integration_difference = chosen.map(|c| c.difference).filter(|difference| difference.is_finite());
+    if let Some(chosen) = chosen {
+        cycle.take_steps(chosen, None);
+    }
     slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen));
     cycle.settle_steps(&slide, chosen)?;
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
@@ -424,6 +435,7 @@ impl<'a> Run<'a> {
         let color_bar = Arc::new(ColorBar::new(&renderer, [range.0, range.1], &plan.time_unit));
         let pixels = [scene.render.width, scene.render.height];
         let for_picture = scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain);
+        let fine = for_picture.table_nodes.filter(|_| scene.surrogate.table_nodes.is_none());
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
                 let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
@@ -443,6 +455,29 @@ impl<'a> Run<'a> {
         let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
         if !scene.network.inputs.is_empty() {
             buffer.set_now(times.unit(flow.start(), flow.tau()));
+        }
+        let has_table = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Network;
+        if has_table && scene.surrogate.table_nodes.is_none() && scene.network.size != Size::Auto {
+            let nodes = settings.nodes(&plan.domain)?;
+            let because = match (fine, settings.table_nodes) {
+                (Some(fine), Some(nodes)) if nodes[..2] == fine[..2] => {
+                    "two a pixel along the longest edge, since a flow of two dimensions folds finer than its data"
+                }
+                (_, Some(_)) => "those of the data, as far as they are bounded",
+                (_, None) => "a closed form has none of its own",
+            };
+            let bytes = nodes.iter().product::<usize>() * size_of::<f32>();
+            Decision::new("surrogate.table_nodes", format_args!("{nodes:?}"), format_args!("{because}; {:.2} MB", bytes as f64 / 1e6))
+                .enter(&mut report.decisions);
+        }
+        for (setting, given, chosen, percentile) in [
+            ("transfer.low", scene.transfer.as_ref().and_then(|t| t.low), range.0, "median"),
+            ("transfer.high", scene.transfer.as_ref().and_then(|t| t.high), range.1, "99.5th percentile"),
+        ] {
+            if given.is_none() {
+                let why = format_args!("{percentile} of the FTLE over the domain at the first slide");
+                Decision::new(setting, chosen, why).enter(&mut report.decisions);
+            }
         }
         report.transfer = Some(transfer);
         report.integration_steps = fixed_steps(flow);
@@ -544,6 +579,11 @@ impl<B: Backend> Cycle<'_, B> {
         report.integration_steps = Some(steps);
         report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
         report.integration_residual = settled.map(|settled| settled.residual);
+        let why = match report.integration_residual {
+            Some(residual) => format!("colours differ by {residual:.4} of their range, rms, from those of many more"),
+            None => format!("the log-stretch differs by {difference:.4} rms from that of twice as many"),
+        };
+        Decision::new("flow.steps", steps, why).enter(&mut report.decisions);
     }
 
     /// Renders all slides. The preparation of the first one began at `begun`.

@@ -1,5 +1,6 @@
 //! Setup of a run from its settings: opens the source, chooses open settings, and checks everything before work starts.
 
+use super::decision::Decision;
 use super::default_tau::default_tau;
 use super::settings::with_ends;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
@@ -38,6 +39,8 @@ pub struct Setup {
     pub slides: Box<dyn Slides>,
     /// Remarks for the user before work starts.
     pub notes: Vec<String>,
+    /// Choices for settings that the scene leaves open.
+    pub decisions: Vec<Decision>,
 }
 
 /// The rule by which steps are chosen on a closed form or a grid.
@@ -83,7 +86,7 @@ impl Setup {
             let accepted = "a method: the commands replay and render choose it by a trial";
             return Err(Refused::new("render.method", "is \"auto\"", accepted).into());
         }
-        let mut notes = Vec::new();
+        let (mut notes, mut decisions) = (Vec::new(), Vec::new());
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
         let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));
@@ -174,6 +177,7 @@ impl Setup {
             let unit = source.describe().time_unit;
             let words = if unit == "s" { in_words(tau) } else { String::new() };
             notes.push(format!("time.tau is not given: {tau} {unit}{words}, {why}"));
+            decisions.push(Decision::new("time.tau", format_args!("{tau} {unit}{words}"), why));
             (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
         }
         let tau = map.tau;
@@ -197,7 +201,7 @@ impl Setup {
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
-        Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes })
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes, decisions })
     }
 }
 

@@ -208,6 +208,30 @@ fn adaptive_paths_have_no_number_of_steps() {
 }
 
 #[test]
+fn what_is_chosen_is_in_the_summary_with_its_reason_and_can_be_given() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = eddy(folder.path());
+    let small = ["render.width=32", "render.height=16", "time.slides=1", "publish.maps=false"];
+    let decisions = |name: &str, keys: &[&str]| {
+        let run = folder.path().join(name);
+        let keys = set(&[&small[..], keys].concat());
+        ridgewatch([&["replay", text(&file), "--out", text(&run)][..], &keys].concat()).success();
+        let summary = summary(&run);
+        let decisions = summary["run"]["decisions"].as_array().unwrap();
+        let word = |decision: &serde_json::Value, key: &str| decision[key].as_str().unwrap().to_owned();
+        decisions.iter().map(|d| ["setting", "chosen", "why"].map(|key| word(d, key))).collect::<Vec<_>>()
+    };
+    let open = decisions("open", &[]);
+    let settings: Vec<&str> = open.iter().map(|[setting, ..]| setting.as_str()).collect();
+    assert_eq!(settings, ["time.tau", "surrogate.table_nodes", "transfer.low", "transfer.high", "flow.steps"], "{open:?}");
+    // Two nodes a pixel along x, and both ends.
+    assert!(open[1][1].starts_with("[65,") && open[1][2].starts_with("two a pixel"), "{open:?}");
+    assert!(open.iter().all(|[.., why]| why.bytes().any(|c| c.is_ascii_digit()) || why.contains("median")), "{open:?}");
+    let keys = ["time.tau=6 days", "surrogate.table_nodes=[32, 16, 1]", "transfer.low=0", "transfer.high=1e-5", "flow.steps=40"];
+    assert_eq!(decisions("given", &keys), Vec::<[String; 3]>::new());
+}
+
+#[test]
 fn a_size_left_to_the_measured_error_grows_and_says_why() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");

@@ -155,9 +155,9 @@ impl MarchControl {
         }
         let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);
         let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
-        // The rays that follow have an error of their own, so that this is rather too much.
-        let filter = minus(pixel.first, pixel.following);
-        self.filter.add(dot(filter, filter) * self.audited_rays() as f64);
+        // The rays that follow err too, about as so many independent rays would.
+        let (filter, rays) = (minus(pixel.first, pixel.following), self.audited_rays() as f64);
+        self.filter.add(dot(filter, filter) / (1.0 / rays + 1.0 / AUDIT_RAYS as f64));
         let steps = minus(pixel.pair, pixel.fine);
         self.steps.add(dot(steps, steps));
         if let Some(lit) = pixel.lit {
