@@ -52,8 +52,8 @@ struct Hit {
     uint32_t cell;
 };
 
-// Walks from `t` along origin + t direction (grid coordinates) until the optical depth of the majorants, each at least `least`, reaches `depth`. Returns false if that is
-// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
+// Walks from `t` along origin + t direction (grid coordinates) until the optical depth of the majorants, each at least `least`, reaches `depth`.
+// Returns false if that is beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 RW_FN bool walk(const SceneBox& box, const float* majorants, float least, const float origin[3], const float direction[3], float t,
                        float end, float depth, Hit& hit) {
     const int strides[3] = {1, box.cells[0], box.cells[0] * box.cells[1]};

@@ -133,6 +133,7 @@ RW_FN bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watc
             const Answer answer = {queue.log_stretch[at], queue.by[at]};
             verdict = resolve(scene, flight, Hit{record.x, record.y, float_bits(record.z)}, answer, watch, counts);
             const uint32_t next = float_bits(record.w);
+            // What follows a raised majorant was drawn under a lower one.
             if (verdict != NULL_COLLISION || next == NONE || flight.raised != was_raised) break;
             at = next;
             flight.dimension += 1;

@@ -132,14 +132,14 @@ fn extinctions_above_their_majorant_stay_unbiased() {
     // Extinction 2 over a length of 1, light from the camera's side: alpha = 1 - exp(-2), radiance = (1 - exp(-4)) / 2.
     for (majorant, exceeds) in [(4.0, false), (2.0, false), (1.6, true), (1.2, true), (0.4, true), (0.2, true)] {
         with_scene(4.0, majorant, [0.0, 0.0, -1.0], |scene| {
-            let (alpha, error, exceeded) = measure(scene, 200_000, |path| path.scattered);
-            assert!((alpha - (1.0 - (-2.0_f64).exp())).abs() < 4.0 * error, "majorant {majorant}: alpha {alpha} +- {error}");
+            let (alpha, alpha_error, exceeded) = measure(scene, 200_000, |path| path.scattered);
+            assert!((alpha - (1.0 - (-2.0_f64).exp())).abs() < 4.0 * alpha_error, "majorant {majorant}: alpha {alpha} +- {alpha_error}");
             let (radiance, error, _) = measure(scene, 200_000, |path| path.radiance[0]);
             assert!((radiance - 0.5 * (1.0 - (-4.0_f64).exp())).abs() < 4.0 * error, "majorant {majorant}: {radiance} +- {error}");
             assert_eq!(exceeded > 0, exceeds, "each is counted");
-            // One weight of 2 ratio - 1 = 19 a path, in at most a fifth of the paths; were there one a collision, most of the variance would be in paths
-            // too rare to be met.
-            assert!(error < 0.02, "majorant {majorant}: error {error}");
+            // One weight of up to 2 ratio - 1 = 19 a path, in a fifth of the paths. Were there one a collision, most of the variance would be in paths too
+            // rare to be met.
+            assert!(alpha_error.max(error) < 0.025, "majorant {majorant}: errors {alpha_error}, {error}");
         });
     }
 }

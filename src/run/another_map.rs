@@ -1,6 +1,7 @@
 //! Another tau or direction, by a command to a run in progress.
 
-use super::cycle::{Cycle, fixed_steps};
+use super::cycle::{Cycle, enter_colours, fixed_steps};
+use super::decision::Decision;
 use super::scene::colours;
 use super::slides::{Slide, Slides};
 use super::steering::Change;
@@ -59,9 +60,16 @@ impl<B: Backend> Cycle<'_, B> {
             self.map.steps = Steps::Fixed(steps);
         }
         self.settled = None;
-        self.run.report.integration_difference = chosen.map(|chosen| chosen.difference).filter(|difference| difference.is_finite());
-        self.run.report.integration_residual = None;
-        self.run.report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));
+        let report = &mut self.run.report;
+        (report.integration_difference, report.integration_residual) = (None, None);
+        report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));
+        Decision::withdraw(&mut report.decisions, &["flow.steps"]);
+        if self.map.tau != former_tau {
+            Decision::withdraw(&mut report.decisions, &["time.tau"]);
+        }
+        if let Some(chosen) = chosen {
+            self.take_steps(chosen, None);
+        }
         self.draw_anew(slide)?;
         let warnings = self.run.flow_warnings(with!(&self.session, on => on.tracer().flow()), chosen);
         slide.warnings.extend(warnings);
@@ -114,6 +122,9 @@ impl<B: Backend> Cycle<'_, B> {
         let range = (transfer.low.unwrap_or_default(), transfer.high.unwrap_or_default());
         run.transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(run.renderer.transfer().extinction_max()) };
         run.report.transfer = Some(run.transfer);
+        if !run.has_range {
+            enter_colours(&plan.scene, run.transfer, &mut run.report.decisions);
+        }
         run.draw_color_bar();
         Ok(())
     }

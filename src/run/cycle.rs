@@ -123,6 +123,8 @@ pub struct RunReport {
     pub warnings: Vec<String>,
 }
 
+/// Reason for the nodes of a table of a flat flow.
+const TWO_A_PIXEL: &str = "two a pixel along the longest edge, since the FTLE of a flow of two dimensions folds finer than data";
 /// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
 const COARSE_IN_TIME: f64 = 0.25;
 /// Frames that refine a window that stands still, after each command.
@@ -360,9 +362,6 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
-    for decision in &run.report.decisions {
-        tracing::info!("{decision}");
-    }
     let mut cycle = Cycle { run, session, map, settled: None };
     if let Some(chosen) = chosen {
         cycle.take_steps(chosen, None);
@@ -425,6 +424,18 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
     Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None, picture: Default::default() }))
 }
 
+/// Enters the choices for the ends of the colour scale that the scene leaves open.
+pub(super) fn enter_colours(scene: &Settings, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
+    let given = scene.transfer.clone().unwrap_or_default();
+    if given.low.is_none() {
+        Decision::new("transfer.low", chosen.low, "median of the FTLE over the domain").enter(decisions);
+    }
+    if given.high.is_none() {
+        let why = "99.5th percentile of the FTLE over the domain, or just above transfer.low where the FTLE hardly varies";
+        Decision::new("transfer.high", chosen.high, why).enter(decisions);
+    }
+}
+
 impl<'a> Run<'a> {
     fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
         let RunGiven { plan, options, threads, stop, began, report } = frame;
@@ -435,7 +446,10 @@ impl<'a> Run<'a> {
         let color_bar = Arc::new(ColorBar::new(&renderer, [range.0, range.1], &plan.time_unit));
         let pixels = [scene.render.width, scene.render.height];
         let for_picture = scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain);
-        let fine = for_picture.table_nodes.filter(|_| scene.surrogate.table_nodes.is_none());
+        let mut because = "256 along the longest edge, or 128 below a network".to_owned();
+        if for_picture.table_nodes.is_some() {
+            because = TWO_A_PIXEL.to_owned();
+        }
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
                 let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
@@ -443,7 +457,16 @@ impl<'a> Run<'a> {
                 window.grid().map(|grid| {
                     let [x, y, z] = grid.shape();
                     let [fine_x, fine_y, _] = for_picture.table_nodes.unwrap_or_default();
-                    scene.surrogate.at_resolution_of([x.max(fine_x), y.max(fine_y), z], most)
+                    let wanted = [x.max(fine_x), y.max(fine_y), z];
+                    because = match (fine_x > x, fine_y > y) {
+                        (true, true) => TWO_A_PIXEL.to_owned(),
+                        (false, false) => "those of the data".to_owned(),
+                        _ => format!("those of the data, or {TWO_A_PIXEL}"),
+                    };
+                    if wanted.iter().product::<usize>() > most {
+                        because += &format!(", in proportion down to {most} in all");
+                    }
+                    scene.surrogate.at_resolution_of(wanted, most)
                 })
             }
             VelocitySource::Analytic(..) => None,
@@ -459,26 +482,11 @@ impl<'a> Run<'a> {
         let has_table = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Network;
         if has_table && scene.surrogate.table_nodes.is_none() && scene.network.size != Size::Auto {
             let nodes = settings.nodes(&plan.domain)?;
-            let because = match (fine, settings.table_nodes) {
-                (Some(fine), Some(nodes)) if nodes[..2] == fine[..2] => {
-                    "two a pixel along the longest edge, since a flow of two dimensions folds finer than its data"
-                }
-                (_, Some(_)) => "those of the data, as far as they are bounded",
-                (_, None) => "a closed form has none of its own",
-            };
             let bytes = nodes.iter().product::<usize>() * size_of::<f32>();
             Decision::new("surrogate.table_nodes", format_args!("{nodes:?}"), format_args!("{because}; {:.2} MB", bytes as f64 / 1e6))
                 .enter(&mut report.decisions);
         }
-        for (setting, given, chosen, percentile) in [
-            ("transfer.low", scene.transfer.as_ref().and_then(|t| t.low), range.0, "median"),
-            ("transfer.high", scene.transfer.as_ref().and_then(|t| t.high), range.1, "99.5th percentile"),
-        ] {
-            if given.is_none() {
-                let why = format_args!("{percentile} of the FTLE over the domain at the first slide");
-                Decision::new(setting, chosen, why).enter(&mut report.decisions);
-            }
-        }
+        enter_colours(&plan.scene, transfer, &mut report.decisions);
         report.transfer = Some(transfer);
         report.integration_steps = fixed_steps(flow);
         let learning = Learning {
@@ -572,7 +580,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// Takes the steps of the picture, or else those of the log-stretch.
-    fn take_steps(&mut self, chosen: StepChoice, settled: Option<PictureSteps>) {
+    pub(super) fn take_steps(&mut self, chosen: StepChoice, settled: Option<PictureSteps>) {
         let (steps, difference) = settled.map_or((chosen.steps, chosen.difference), |settled| (settled.steps, settled.difference));
         self.map.steps = Steps::Fixed(steps);
         let report = &mut self.run.report;
@@ -580,8 +588,9 @@ impl<B: Backend> Cycle<'_, B> {
         report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
         report.integration_residual = settled.map(|settled| settled.residual);
         let why = match report.integration_residual {
-            Some(residual) => format!("colours differ by {residual:.4} of their range, rms, from those of many more"),
-            None => format!("the log-stretch differs by {difference:.4} rms from that of twice as many"),
+            Some(residual) => format!("colours differ by at most {residual:.4} of their range, rms, from those of many more"),
+            None if difference.is_finite() => format!("the log-stretch differs by {difference:.4} rms from that of twice as many"),
+            None => "no number of steps had a finite difference from twice as many".to_owned(),
         };
         Decision::new("flow.steps", steps, why).enter(&mut report.decisions);
     }
@@ -866,6 +875,7 @@ impl Run<'_> {
             self.threads.render().install(|| renderer.set_scene(scene))?;
         }
         if let Some(Range { low, high }) = set.range {
+            Decision::withdraw(&mut self.report.decisions, &["transfer.low", "transfer.high"]);
             self.transfer = TransferRecord { low, high, ..self.transfer };
             self.report.transfer = Some(self.transfer);
             // Its residuals are those of another ramp.
@@ -875,6 +885,7 @@ impl Run<'_> {
         // The flow map follows once all commands are applied.
         self.asked = asked(&self.plan.map, &self.asked, set);
         if let Some(method) = set.method {
+            Decision::withdraw(&mut self.report.decisions, &["render.method"]);
             // Of another method.
             self.progress.seconds_per_sample = None;
             // A budget waits for the method that has one.

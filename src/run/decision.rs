@@ -9,7 +9,7 @@ pub struct Decision {
     pub setting: String,
     /// What was chosen.
     pub chosen: String,
-    /// The reason, with the number that was measured or counted.
+    /// The reason, with the number that decided if there is one.
     pub why: String,
 }
 
@@ -21,8 +21,14 @@ impl Decision {
 
     /// Adds the decision to others, of which it replaces the one for the same setting.
     pub(super) fn enter(self, decisions: &mut Vec<Self>) {
-        decisions.retain(|earlier| earlier.setting != self.setting);
+        tracing::info!("{self}");
+        Self::withdraw(decisions, &[&self.setting]);
         decisions.push(self);
+    }
+
+    /// Removes the decisions for these settings, which a command has given.
+    pub(super) fn withdraw(decisions: &mut Vec<Self>, settings: &[&str]) {
+        decisions.retain(|decision| !settings.contains(&decision.setting.as_str()));
     }
 }
 

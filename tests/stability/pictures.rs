@@ -52,7 +52,7 @@ fn opacity(film: &Film) -> (f64, f64) {
     (mean, (variance / n).sqrt())
 }
 
-/// Fails if neither the path nor the next frame raises a majorant that was exceeded, and without the weights of collisions above it.
+/// Fails unless the path and the next frame raise a majorant that was exceeded, and without the weights of collisions above it.
 #[test]
 fn majorant_too_low() {
     const EXTINCTION: f64 = 5.0;
@@ -80,7 +80,6 @@ fn majorant_too_low() {
             100.0 * exceeded,
             clamped(*low)
         );
-        // Every query sees the same extinction, so that all or none are above the majorant.
         assert_eq!(*exceeded > 0.0, *low > 0.0, "what is above its majorant is counted");
         assert_eq!(*exceeded2, 0.0, "the next frame's majorant is raised");
         assert!((second - truth).abs() < 4.0 * error2 && *error2 < 1.5 * usual, "{low}: {second} +- {error2}");
