@@ -6,7 +6,7 @@ use crate::kit::scene::{double_gyre, run_frames, setup, write};
 use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::os::unix::fs::MetadataExt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -93,6 +93,34 @@ fn the_steps_of_the_integration_follow_tolerance_and_colours() {
         let residual = frames[number].record.integration_residual.unwrap();
         assert!(residual <= tolerance / 15.0, "frame {number}: {residual}");
     }
+}
+
+/// What a command sets is a decision no more, and what follows from it is decided anew.
+#[test]
+fn decisions_follow_commands() {
+    let keys = "time.tau = 10\ntime.frames_per_slide = 3\nsurrogate.kind = \"table\"\nrender.method = \"marched\"\n";
+    let decisions = |set: Option<Value>| {
+        let (_, report) = steered(setup(&double_gyre([48, 24, 1], keys), &[]), |steering, frame| {
+            if let Some(set) = set.as_ref().filter(|_| frame.record.frame == 0) {
+                command(steering, set.clone());
+            }
+            false
+        });
+        let decisions: BTreeMap<String, String> = report.decisions.into_iter().map(|d| (d.setting, d.chosen)).collect();
+        let transfer = report.transfer.unwrap();
+        for (setting, value) in [("transfer.low", transfer.low), ("transfer.high", transfer.high)] {
+            assert!(decisions.get(setting).is_none_or(|chosen| *chosen == value.to_string()), "{decisions:?}");
+        }
+        assert_eq!(decisions.get("flow.steps"), report.integration_steps.map(|steps| steps.to_string()).as_ref());
+        decisions
+    };
+    let open = decisions(None);
+    assert_eq!(open.keys().collect::<Vec<_>>(), ["flow.steps", "surrogate.table_nodes", "transfer.high", "transfer.low"]);
+    let shorter = decisions(Some(json!({"time.tau": 5})));
+    assert!(open.keys().eq(shorter.keys()), "{shorter:?}");
+    assert!(["flow.steps", "transfer.low", "transfer.high"].iter().all(|setting| open[*setting] != shorter[*setting]), "{shorter:?}");
+    let coloured = decisions(Some(json!({"transfer": {"low": 0.01, "high": 0.02}})));
+    assert_eq!(coloured.keys().collect::<Vec<_>>(), ["flow.steps", "surrogate.table_nodes"]);
 }
 
 #[test]

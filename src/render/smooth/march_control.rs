@@ -155,9 +155,9 @@ impl MarchControl {
         }
         let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);
         let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
-        // The rays that follow err too. Exact for independent rays; up to a fifth too little for four rays whose error falls faster than theirs.
+        // The rays that follow err too: by at least this share of the error of the first, if errors fall no faster than with the square of the number.
         let (filter, rays) = (minus(pixel.first, pixel.following), self.audited_rays() as f64);
-        self.filter.add(dot(filter, filter) / (1.0 / rays + 1.0 / AUDIT_RAYS as f64));
+        self.filter.add(rays * dot(filter, filter) / (1.0 + (rays / AUDIT_RAYS as f64).powi(2)));
         let steps = minus(pixel.pair, pixel.fine);
         self.steps.add(dot(steps, steps));
         if let Some(lit) = pixel.lit {
