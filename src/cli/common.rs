@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{Decision, RunError, Setup};
+use ridgewatch::run::{Decision, RunError, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -197,10 +197,7 @@ pub fn ring_folder(option: Option<&Path>) -> Result<PathBuf> {
 
 /// Describes a number of steps that was chosen by its error.
 pub fn chosen_steps(steps: u64, difference: f64, residual: Option<f64>) -> String {
-    match residual {
-        Some(residual) => format!("{steps} steps a path: colours differ by {residual:.3} of their range, rms, from those of many more"),
-        None => format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many"),
-    }
+    format!("{steps} steps a path: {}", why_steps(difference, residual))
 }
 
 /// Refuses a checkpoint option if nothing is trained.

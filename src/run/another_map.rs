@@ -1,7 +1,7 @@
 //! Another tau or direction, by a command to a run in progress.
 
-use super::cycle::{Cycle, enter_colours, fixed_steps};
-use super::decision::Decision;
+use super::cycle::{Cycle, fixed_steps};
+use super::decision::{Decision, enter_colours};
 use super::scene::colours;
 use super::slides::{Slide, Slides};
 use super::steering::Change;

@@ -6,7 +6,7 @@
 
 use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
-use super::decision::Decision;
+use super::decision::{Decision, enter_colours, why_steps};
 use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
@@ -424,18 +424,6 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
     Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None, picture: Default::default() }))
 }
 
-/// Enters the choices for the ends of the colour scale that the scene leaves open.
-pub(super) fn enter_colours(scene: &Settings, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
-    let given = scene.transfer.clone().unwrap_or_default();
-    if given.low.is_none() {
-        Decision::new("transfer.low", chosen.low, "median of the FTLE over the domain").enter(decisions);
-    }
-    if given.high.is_none() {
-        let why = "99.5th percentile of the FTLE over the domain, or just above transfer.low where the FTLE hardly varies";
-        Decision::new("transfer.high", chosen.high, why).enter(decisions);
-    }
-}
-
 impl<'a> Run<'a> {
     fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
         let RunGiven { plan, options, threads, stop, began, report } = frame;
@@ -587,12 +575,7 @@ impl<B: Backend> Cycle<'_, B> {
         report.integration_steps = Some(steps);
         report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
         report.integration_residual = settled.map(|settled| settled.residual);
-        let why = match report.integration_residual {
-            Some(residual) => format!("colours differ by at most {residual:.4} of their range, rms, from those of many more"),
-            None if difference.is_finite() => format!("the log-stretch differs by {difference:.4} rms from that of twice as many"),
-            None => "no number of steps had a finite difference from twice as many".to_owned(),
-        };
-        Decision::new("flow.steps", steps, why).enter(&mut report.decisions);
+        Decision::new("flow.steps", steps, why_steps(difference, report.integration_residual)).enter(&mut report.decisions);
     }
 
     /// Renders all slides. The preparation of the first one began at `begun`.

@@ -1,5 +1,6 @@
 //! Settings that a scene leaves open, and what was chosen for them.
 
+use super::{Settings, TransferRecord};
 use serde::Serialize;
 
 /// A choice for a setting that the scene leaves open. Giving the setting overrides it.
@@ -35,5 +36,27 @@ impl Decision {
 impl std::fmt::Display for Decision {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{} = {}: {}", self.setting, self.chosen, self.why)
+    }
+}
+
+/// Enters the choices for the ends of the colour scale that the scene leaves open.
+pub(super) fn enter_colours(scene: &Settings, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
+    let given = scene.transfer.clone().unwrap_or_default();
+    if given.low.is_none() {
+        Decision::new("transfer.low", chosen.low, "median of the FTLE over the domain").enter(decisions);
+    }
+    if given.high.is_none() {
+        let why = "99.5th percentile of the FTLE over the domain, or just above transfer.low where the FTLE hardly varies";
+        Decision::new("transfer.high", chosen.high, why).enter(decisions);
+    }
+}
+
+/// Why a number of Runge-Kutta steps suffices: the optical residual of the picture's steps, or else the root mean square difference of the log-stretch from
+/// that of twice as many.
+pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
+    match residual {
+        Some(residual) => format!("colours differ by {residual:.3} of their range, rms, from those of many more"),
+        None if difference.is_finite() => format!("the log-stretch differs by {difference:.3} rms from that of twice as many"),
+        None => "no number of steps had a finite difference from twice as many".to_owned(),
     }
 }

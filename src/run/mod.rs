@@ -29,7 +29,7 @@ pub use crate::trust::TrustedError;
 pub use checkpoints::CheckpointTotals;
 pub use color_bar::ColorBar;
 pub use cycle::{Event, RunOptions, RunReport, ShownSlide, run, run_on};
-pub use decision::Decision;
+pub use decision::{Decision, why_steps};
 pub use error::RunError;
 pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;
