@@ -75,6 +75,12 @@ impl Backend for Timed {
     ) -> Result<AuditFindings, DeviceError> {
         self.inner.audit(request, tracer, surrogate)
     }
+    fn most_refined_nodes(&self) -> usize {
+        self.inner.most_refined_nodes()
+    }
+    fn nodes_per_sample(&self) -> usize {
+        self.inner.nodes_per_sample()
+    }
     fn replan(
         &mut self,
         shortage: &DeviceError,

@@ -230,7 +230,7 @@ impl SceneFile {
         let gridded = matches!(kind, Archive | Live | Turbulence);
         let adaptive = flow.integrator == Integrator::DormandPrince;
         let (learns, hashed) = (self.surrogate.kind != Kind::Table, network.encoding == Encoding::HashGrid);
-        let rules: [(bool, &'static str, &'static [&'static str]); 18] = [
+        let rules: [(bool, &'static str, &'static [&'static str]); 19] = [
             (*kind == Archive, "only with source.kind = \"archive\"", &["archive"]),
             (self.archive.files.is_empty(), "only without archive.files", &["archive.synthetic"]),
             (*kind == Live, "only with source.kind = \"live\"", &["live"]),
@@ -242,6 +242,11 @@ impl SceneFile {
             (!adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\"", &["flow.tolerance"]),
             (gridded, "only with snapshots; a closed form is known everywhere", &["flow.interpolation"]),
             (self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\"", &["surrogate.table_nodes"]),
+            (
+                self.surrogate.kind == Kind::Table && self.surrogate.table_nodes.is_none(),
+                "only with surrogate.kind = \"table\" and without surrogate.table_nodes",
+                &["surrogate.refine"],
+            ),
             (learns || network.size == Size::Auto, LEARNS, &["network"]),
             (hashed, "only with network.encoding = \"hash_grid\"", &HASHED),
             (!hashed, "only with network.encoding = \"frequency\"", &["network.octaves"]),

@@ -143,6 +143,16 @@ impl SurrogateDevice for OnLine {
         Ok(BreakingTable::new(line, Table::trace(&tracer.host, nodes)?))
     }
 
+    fn untraced_table(tracer: &BreakingTracer, nodes: [usize; 3]) -> Result<BreakingTable, DeviceError> {
+        tracer.line.call("allocating a finer table")?;
+        Ok(BreakingTable::new(&tracer.line, Table::untraced(tracer.host.domain(), nodes)))
+    }
+
+    fn trace_more(tracer: &BreakingTracer, table: &mut BreakingTable, most: usize) -> Result<bool, DeviceError> {
+        tracer.line.call("tracing more nodes")?;
+        Arc::get_mut(&mut table.0).unwrap().values.trace_more(&tracer.host, most)
+    }
+
     fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         if let Some(table) = &frozen.table {
             table.0.line.call("looking up in a table")?;
@@ -306,6 +316,12 @@ impl Surrogate for BreakingSurrogate {
     }
     fn window_slid(&mut self, tracer: &BreakingTracer, _: &AtomicBool) -> Result<(), DeviceError> {
         self.0.window_slid(tracer)
+    }
+    fn refine_table(&mut self, tracer: &BreakingTracer, nodes: [usize; 3], most: usize, _: &AtomicBool) -> Result<bool, DeviceError> {
+        self.0.refine_table(tracer, nodes, most)
+    }
+    fn table_nodes(&self) -> Option<[usize; 3]> {
+        self.0.table_nodes()
     }
     fn checkpoint(&self) -> Result<CheckpointState, DeviceError> {
         self.0.checkpoint()
@@ -637,6 +653,48 @@ fn a_slide_finds_the_old_table_gone() {
     let found = made_on(Breaking::on(&line), &sliding(Kind::Table, 1), &options, &mut |_| std::thread::sleep(Duration::from_millis(30)));
     assert!(found.error.is_none(), "{:?}", found.error);
     assert_eq!(line.tables_before.load(Ordering::Relaxed), 0, "tables that were there when another was traced");
+}
+
+/// Pictures that stand still, so that their table is refined before the second frame.
+fn standing() -> SceneFile {
+    let keys = "
+        source.nodes = [12, 6, 6]
+        source.snapshots = 8
+        time.tau = 4
+        time.slides = 1
+        time.frames_per_slide = 4
+        flow.steps = 8
+        trust.cells = [2, 2, 2]
+        render.method = \"two_level\"
+        surrogate.kind = \"table\"
+    ";
+    scene::parse(&scene::scene("turbulence", [16, 8, 2], keys), &[]).unwrap()
+}
+
+/// Samples per pixel of each frame's picture: two more in each, from two on where it started anew.
+fn samples(made: &Made) -> Vec<f64> {
+    made.records.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect()
+}
+
+/// A device without room for a finer table goes on with the table that it has; one that is lost meanwhile leaves both to the CPU.
+#[test]
+fn a_table_that_cannot_be_refined_stays() {
+    let whole = Line::new(usize::MAX, How::Fault);
+    let unbroken = made(Breaking::on(&whole), &standing());
+    assert_eq!(samples(&unbroken), [2.0, 2.0, 4.0, 6.0], "{:?}", unbroken.error);
+
+    let short = Line::of_kind(Some("allocating a finer table"), 0, How::Shortage(1));
+    let found = made(Breaking::on(&short), &standing());
+    assert!(found.error.is_none() && short.has_failed());
+    assert_eq!((samples(&found), found.count("planned anew")), (vec![2.0, 4.0, 6.0, 8.0], 0));
+    assert!(found.records.iter().all(|record| record.device == NAME));
+
+    let lost = Line::of_kind(Some("tracing more nodes"), 0, How::Fault);
+    let found = made(Breaking::on(&lost), &standing());
+    assert!(found.error.is_none() && found.count(ENDED) == 1, "{:?}", found.error);
+    assert_eq!(samples(&found), samples(&unbroken));
+    let devices: Vec<bool> = found.records.iter().map(|record| record.device == "cpu").collect();
+    assert_eq!(devices, [false, true, true, true]);
 }
 
 /// Checkpoints of a network that a device trains: a copy whose download takes long does not hold the frames up; without room for a copy frames wait and a

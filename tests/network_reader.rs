@@ -59,7 +59,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
         ("start and duration", Kind::Network, &both, "2.5 1.2"),
         ("start and duration, frequency", Kind::Network, &of_both, "2.5 1.2"),
     ] {
-        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
+        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]), ..SurrogateSettings::default() };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
         let mut buffer = ReplayBuffer::new(2 * samples.len());
         for (window, samples) in [(&tracer, &samples), (&later, &other)] {
@@ -99,7 +99,7 @@ fn the_reader_refuses_what_it_cannot_evaluate() {
         ("flow map", &flow_map, Kind::Network, "", "its target is not ftle"),
         ("table", &hash, Kind::Table, "", "no network"),
     ] {
-        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
+        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]), ..SurrogateSettings::default() };
         let surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();

@@ -14,7 +14,7 @@ use ridgewatch::run::{FrameRecord, RunOptions, Setup};
 use ridgewatch::surrogate::network::{Input, NetworkSettings, Times};
 use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, SurrogateSettings, build};
 
-const SETTINGS: SurrogateSettings = SurrogateSettings { kind: Kind::Network, table_nodes: None };
+const SETTINGS: SurrogateSettings = SurrogateSettings { kind: Kind::Network, table_nodes: None, refine: true };
 
 /// Labels of two windows contradict each other, unless the network is told of which window each is. Half a period apart the double gyre is its
 /// own mirror image.

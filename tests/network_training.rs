@@ -15,7 +15,7 @@ fn small() -> NetworkSettings {
 }
 
 fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Trace) -> HostSurrogate {
-    let settings = SurrogateSettings { kind, table_nodes: Some([33, 17, 1]) };
+    let settings = SurrogateSettings { kind, table_nodes: Some([33, 17, 1]), ..SurrogateSettings::default() };
     build(&settings, network, tracer.flow().domain(), 5, tracer).unwrap()
 }
 
@@ -328,7 +328,7 @@ fn numbers_that_are_not_finite_are_refused_in_every_checkpoint() {
 fn wrong_settings_are_refused_by_name() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
     let fault = |kind, network: NetworkSettings, nodes| {
-        let settings = SurrogateSettings { kind, table_nodes: nodes };
+        let settings = SurrogateSettings { kind, table_nodes: nodes, ..SurrogateSettings::default() };
         build(&settings, &network, tracer.domain(), 0, &tracer).err().unwrap().to_string()
     };
     assert!(fault(Kind::Network, NetworkSettings { width: 0, ..small() }, None).contains("network.width = 0"));

@@ -200,6 +200,12 @@ impl Surrogate for HostSurrogate {
     fn window_slid(&mut self, tracer: &Box<dyn Tracer>, stop: &AtomicBool) -> Result<(), DeviceError> {
         self.window_slid(&Interruptible::new(tracer, stop))
     }
+    fn refine_table(&mut self, tracer: &Box<dyn Tracer>, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
+        self.refine_table(&Interruptible::new(tracer, stop), nodes, most)
+    }
+    fn table_nodes(&self) -> Option<[usize; 3]> {
+        self.table_nodes()
+    }
     fn checkpoint(&self) -> Result<CheckpointState, DeviceError> {
         self.checkpoint()
     }

@@ -102,6 +102,16 @@ pub trait Backend: Send + Sync + Sized {
         surrogate: &mut Option<Self::Surrogate>,
     ) -> Result<Option<String>, DeviceError>;
 
+    /// Largest number of nodes to which a table may be refined while its picture stands still.
+    fn most_refined_nodes(&self) -> usize {
+        MOST_REFINED_NODES
+    }
+
+    /// Nodes of a finer table that are traced for every sample of a frame, so that a frame takes about twice as long.
+    fn nodes_per_sample(&self) -> usize {
+        NODES_PER_SAMPLE
+    }
+
     /// Reaction to a lost device.
     fn when_lost(&self) -> WhenLost {
         WhenLost::Cpu
@@ -117,6 +127,11 @@ pub trait Backend: Send + Sync + Sized {
         Vec::new()
     }
 }
+
+/// Largest number of nodes of a refined table on the CPU: 64 MiB.
+const MOST_REFINED_NODES: usize = 1 << 24;
+/// Nodes that the CPU traces for every sample of a frame.
+const NODES_PER_SAMPLE: usize = 16;
 
 /// Frozen surrogate of a backend.
 pub type FrozenOf<B> = <<B as Backend>::Surrogate as Surrogate>::Frozen;
@@ -142,6 +157,11 @@ pub trait Surrogate: Send + Sync + Sized {
     fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError>;
     /// Moves the surrogate to a new window. Setting `stop` may end the tracing of its table early; the surrogate is then unusable.
     fn window_slid(&mut self, tracer: &Self::Tracer, stop: &AtomicBool) -> Result<(), DeviceError>;
+    /// Traces about `most` further nodes of a finer table, as [`ridgewatch_surrogate::Hybrid::refine_table`] does. Setting `stop` may end it early; the
+    /// surrogate is then unusable.
+    fn refine_table(&mut self, tracer: &Self::Tracer, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError>;
+    /// Nodes of the table along x, y, z; `None` without a table.
+    fn table_nodes(&self) -> Option<[usize; 3]>;
     /// Frees device memory before another surrogate replaces this one.
     fn release(&mut self) -> Result<(), DeviceError> {
         Ok(())

@@ -132,7 +132,7 @@ impl Opened {
     /// Nodes of a table at the resolution of the data, or as the program chooses for closed forms.
     pub(super) fn own_nodes(&self, is_gpu: bool) -> [usize; 3] {
         let most = if is_gpu { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
-        let open = SurrogateSettings { kind: Kind::Table, table_nodes: None };
+        let open = SurrogateSettings { kind: Kind::Table, ..SurrogateSettings::default() };
         let shaped = self.shape().map_or(open.clone(), |shape| open.at_resolution_of(shape, most));
         shaped.nodes(&self.plan.domain).unwrap_or([64; 3])
     }
@@ -485,7 +485,7 @@ fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), 
     let Some(tracer) = tracer_of(bench, backend, "the tracer of tables", &map)? else { return Ok(()) };
     let own = bench.opened.own_nodes(bench.charting.device.is_gpu());
     // The first table compiles kernels.
-    let small = SurrogateSettings { kind: Kind::Table, table_nodes: Some(own.map(|n| n.min(8))) };
+    let small = SurrogateSettings { kind: Kind::Table, table_nodes: Some(own.map(|n| n.min(8))), ..SurrogateSettings::default() };
     surrogate_of(bench, backend, "a small table", &small, &NetworkSettings::default(), &tracer)?;
     for factor in [1.0, 0.5, 2.0, 0.25, 4.0] {
         let nodes = scaled(own, factor);
@@ -494,7 +494,7 @@ fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), 
         if !fits(bench, &what, count, count) {
             continue;
         }
-        let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+        let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes), ..SurrogateSettings::default() };
         let network = NetworkSettings::default();
         let began = Instant::now();
         if let Some(surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? {
@@ -534,7 +534,7 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
             continue;
         }
         let began = Instant::now();
-        let settings = SurrogateSettings { kind, table_nodes: Some(nodes) };
+        let settings = SurrogateSettings { kind, table_nodes: Some(nodes), ..SurrogateSettings::default() };
         let Some(mut surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
         let mut spent = label_seconds + began.elapsed().as_secs_f64();
         let mut trained = 0.0;

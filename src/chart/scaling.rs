@@ -148,7 +148,7 @@ fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, is_gpu: bool,
         return Ok(None);
     }
     let request = SurrogateRequest {
-        settings: &SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) },
+        settings: &SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes), ..SurrogateSettings::default() },
         network: &NetworkSettings::default(),
         domain: &opened.plan.domain,
         seed: opened.plan.scene.seed,

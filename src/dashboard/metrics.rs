@@ -90,6 +90,7 @@ impl Totals {
         for (sum, more) in [
             (&mut sum.slide, seconds.slide),
             (&mut sum.waiting, seconds.waiting),
+            (&mut sum.refine, seconds.refine),
             (&mut sum.render, seconds.render),
             (&mut sum.trace, seconds.trace),
             (&mut sum.predict, seconds.predict),
@@ -128,6 +129,7 @@ impl Totals {
         let stages = [
             ("slide", seconds.slide),
             ("waiting", seconds.waiting),
+            ("refine", seconds.refine),
             ("render", seconds.render),
             ("trace", seconds.trace),
             ("predict", seconds.predict),

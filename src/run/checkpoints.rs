@@ -191,13 +191,13 @@ mod tests {
     use crate::field::analytic::Analytic;
     use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
     use crate::surrogate::network::NetworkSettings;
-    use crate::surrogate::{HostSurrogate, Kind, SurrogateSettings, build};
+    use crate::surrogate::{HostSurrogate, SurrogateSettings, build};
     use std::sync::mpsc::Sender;
 
     fn table() -> HostSurrogate {
         let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
         let tracer = cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
-        let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some([3, 3, 1]) };
+        let settings = SurrogateSettings { table_nodes: Some([3, 3, 1]), ..SurrogateSettings::default() };
         build(&settings, &NetworkSettings::default(), tracer.domain(), 0, &tracer).unwrap()
     }
 

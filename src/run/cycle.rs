@@ -8,6 +8,7 @@ use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::decision::{Decision, enter_colours, why_steps};
 use super::record::Frame;
+use super::refine::Frames;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
@@ -171,6 +172,8 @@ pub(super) struct Learning {
     pub(super) start: f64,
     /// Settings of the surrogate, with the nodes of the data if a table has no others.
     pub(super) settings: SurrogateSettings,
+    /// Reason for the nodes of a table of a new window.
+    pub(super) why_nodes: String,
     /// Search for the size, with `size = "auto"`.
     pub(super) sizing: Option<Sizing>,
     /// Size for the next frame; `None` to keep the present one.
@@ -216,6 +219,10 @@ pub(super) struct RunProgress {
     pub(super) commands: Vec<Command>,
     /// Seconds that the run waited for a step and looked for commands, since the last frame.
     pub(super) waited: f64,
+    /// Nodes of the finer table that is being traced.
+    pub(super) refining: Option<[usize; 3]>,
+    /// True once the device had no room for a finer table.
+    pub(super) is_refused_nodes: bool,
 }
 
 impl RunProgress {
@@ -256,6 +263,8 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) session: Session<B>,
     /// Flow map with its number of steps: that of the first slide, so that frames are comparable, unless the picture decides on it.
     pub(super) map: FlowMap,
+    /// Frames of the slide before, without warm-up; 0 in the first slide.
+    pub(super) frames_before: usize,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
     pub(super) settled: Option<(StepChoice, PictureSteps)>,
 }
@@ -280,6 +289,8 @@ pub(super) struct FramePlace {
     pub(super) is_warmup: bool,
     /// Seconds of preparing the slide, for its first frame; 0 for the others.
     pub(super) preparing: f64,
+    /// Seconds of tracing nodes of a finer table before the frame.
+    pub(super) refining: f64,
 }
 
 /// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame, which setting `options.abandon` ends
@@ -362,7 +373,7 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
-    let mut cycle = Cycle { run, session, map, settled: None };
+    let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None };
     if let Some(chosen) = chosen {
         cycle.take_steps(chosen, None);
     }
@@ -483,6 +494,7 @@ impl<'a> Run<'a> {
             times,
             start: flow.start(),
             settings,
+            why_nodes: because,
             sizing,
             resize: None,
             budget: TrainingBudget::new(scene.training.share),
@@ -649,6 +661,7 @@ impl<B: Backend> Cycle<'_, B> {
     pub(super) fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
+        self.run.progress.refining = None;
         let rebuilds = self.run.learning.resize.is_some();
         transaction!(self, slide, run, on => if rebuilds { run.rebuild_surrogate(on) } else { run.slide_surrogate(on) });
         self.run.resized();
@@ -689,8 +702,8 @@ impl<B: Backend> Cycle<'_, B> {
                 self.probe_again(slide)?;
             }
             slide.waited += std::mem::take(&mut self.run.progress.waited);
-            let place =
-                FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            let preparing = if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 };
+            let mut place = FramePlace { is_warmup: number < warmups, preparing, refining: 0.0 };
             if self.run.learning.resize.is_some() {
                 transaction!(self, slide, run, on => run.rebuild_surrogate(on));
                 self.run.resized();
@@ -703,6 +716,12 @@ impl<B: Backend> Cycle<'_, B> {
                 with!(&mut self.session, on => on.picture = Default::default());
             }
             let start = Instant::now();
+            if !place.is_warmup {
+                let is_open = target.is_some() || slides.is_awaited().is_some() || self.run.is_paused() || number >= planned;
+                let left = (!is_open).then(|| planned - number);
+                self.refine(slide, Frames { shown: number - warmups, planned: left, before: self.frames_before })?;
+                place.refining = start.elapsed().as_secs_f64();
+            }
             transaction!(self, slide, run, on => run.learn_shorter(on, slide));
             let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
             slide.warnings.clear();
@@ -739,6 +758,7 @@ impl<B: Backend> Cycle<'_, B> {
             let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
             if !self.is_commanded_meanwhile(slides)? {
+                self.frames_before = number.saturating_sub(warmups);
                 return Ok(());
             }
         }

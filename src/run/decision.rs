@@ -23,8 +23,10 @@ impl Decision {
     /// Adds the decision to others, of which it replaces the one for the same setting.
     pub(super) fn enter(self, decisions: &mut Vec<Self>) {
         tracing::info!("{self}");
-        Self::withdraw(decisions, &[&self.setting]);
-        decisions.push(self);
+        match decisions.iter_mut().find(|decision| decision.setting == self.setting) {
+            Some(before) => *before = self,
+            None => decisions.push(self),
+        }
     }
 
     /// Removes the decisions for these settings, which a command has given.

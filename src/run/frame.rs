@@ -119,10 +119,11 @@ impl Run<'_> {
         record.seconds = StageSeconds {
             slide: place.preparing,
             waiting: slide.waited,
+            refine: place.refining,
             render: work.render_seconds - tally.trace_seconds - tally.predict_seconds,
             trace: tally.trace_seconds,
             predict: tally.predict_seconds,
-            audit: preparation_seconds + work.audit_seconds + assess_seconds,
+            audit: preparation_seconds - place.refining + work.audit_seconds + assess_seconds,
             train: train_seconds,
             device: stats.device_seconds,
             checkpoint: std::mem::take(&mut self.progress.checkpoint_pause),
@@ -183,11 +184,11 @@ impl Run<'_> {
         };
         let smooth = match method {
             method if method.is_smooth() => {
-                let nodes = self
-                    .learning
-                    .settings
-                    .nodes(&self.plan.domain)
-                    .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
+                let set = || self.learning.settings.nodes(&self.plan.domain);
+                let nodes = match surrogate.as_ref().filter(|surrogate| !surrogate.learns()).and_then(Surrogate::table_nodes) {
+                    Some(nodes) => nodes,
+                    None => set().map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?,
+                };
                 Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes })
             }
             _ => None,

@@ -15,6 +15,7 @@ mod frame;
 mod memory;
 mod prepare;
 mod record;
+mod refine;
 mod scene;
 mod settings;
 mod setup;

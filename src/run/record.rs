@@ -168,6 +168,9 @@ pub struct StageSeconds {
     pub slide: f64,
     /// Waiting for snapshots.
     pub waiting: f64,
+    /// Tracing nodes of a finer table, before the frame.
+    #[serde(default)]
+    pub refine: f64,
     /// Rendering without its traces.
     pub render: f64,
     /// Tracing inside rendering.

@@ -25,6 +25,18 @@ pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     /// The device fails or lacks memory.
     fn trace_table(tracer: &Self::Tracer<'_>, nodes: [usize; 3], old: Option<Self::Table>) -> Result<Self::Table, DeviceError>;
 
+    /// Creates a table with `nodes` along x, y, z, none of which is traced yet.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    fn untraced_table(tracer: &Self::Tracer<'_>, nodes: [usize; 3]) -> Result<Self::Table, DeviceError>;
+
+    /// Traces about `most` further nodes of a table that is not shared yet. True once every node is traced.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    fn trace_more(tracer: &Self::Tracer<'_>, table: &mut Self::Table, most: usize) -> Result<bool, DeviceError>;
+
     /// Writes the log-stretch of a frozen surrogate at unit points into `out` (same length).
     ///
     /// # Errors

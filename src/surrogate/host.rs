@@ -29,6 +29,14 @@ impl SurrogateDevice for Host {
         }
     }
 
+    fn untraced_table(tracer: &dyn Trace, nodes: [usize; 3]) -> Result<Table, DeviceError> {
+        Ok(Table::untraced(tracer.flow().domain(), nodes))
+    }
+
+    fn trace_more(tracer: &dyn Trace, table: &mut Table, most: usize) -> Result<bool, DeviceError> {
+        table.trace_more(tracer, most)
+    }
+
     fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         match (&frozen.table, &frozen.network) {
             (Some(table), None) => table.interpolate(points, out),

@@ -24,8 +24,13 @@ const USELESS: f32 = 0.05;
 /// A surrogate whose numbers are on the device `D`.
 pub struct Hybrid<D: SurrogateDevice> {
     kind: Kind,
+    /// Nodes of the table of a new window.
     nodes: [usize; 3],
     table: Option<D::Table>,
+    /// Nodes of the present table.
+    table_nodes: [usize; 3],
+    /// The finer table that is being traced, with its nodes.
+    finer: Option<(D::Table, [usize; 3])>,
     trainer: Option<Trainer<D::Training>>,
     shrinkage: f32,
     /// True if the table has changed since the last training.
@@ -42,7 +47,7 @@ impl<D: SurrogateDevice> Predict for Hybrid<D> {
     }
 
     fn bytes(&self) -> usize {
-        let table = if self.kind == Kind::Network { 0 } else { self.nodes.iter().product::<usize>() * size_of::<f32>() };
+        let table = if self.kind == Kind::Network { 0 } else { self.table_nodes.iter().product::<usize>() * size_of::<f32>() };
         table + self.trainer.as_ref().map_or(0, |trainer| trainer.training.shape().parameters() * size_of::<f32>())
     }
 }
@@ -85,19 +90,47 @@ impl<D: SurrogateDevice> Hybrid<D> {
         // Two-dimensional tables have one node along z.
         let dimensions = tracer.flow().domain().dimensions.clamp(2, 3);
         let nodes = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut surrogate = Self { kind, nodes, table: None, trainer, shrinkage: 0.0, slid: false };
+        let mut surrogate = Self { kind, nodes, table: None, table_nodes: nodes, finer: None, trainer, shrinkage: 0.0, slid: false };
         Ok(surrogate.trace_table(tracer).map(|()| surrogate))
     }
 
-    /// Traces the table, if there is one.
+    /// Traces the table, if there is one, with the nodes of a new window.
     ///
     /// # Errors
     /// The device fails or lacks memory.
     pub fn trace_table(&mut self, tracer: &D::Tracer<'_>) -> Result<(), DeviceError> {
+        self.finer = None;
         if self.kind != Kind::Network {
-            self.table = Some(D::trace_table(tracer, self.nodes, self.table.take())?);
+            // A table of other nodes cannot be traced again in place.
+            let old = self.table.take().filter(|_| self.table_nodes == self.nodes);
+            self.table_nodes = self.nodes;
+            self.table = Some(D::trace_table(tracer, self.nodes, old)?);
         }
         Ok(())
+    }
+
+    /// Nodes of the present table along x, y, z; `None` without a table.
+    pub fn table_nodes(&self) -> Option<[usize; 3]> {
+        self.table.as_ref().map(|_| self.table_nodes)
+    }
+
+    /// Traces about `most` further nodes of a finer table with `nodes` along x, y, z, which replaces the present one as soon as it is complete. Returns
+    /// whether it did. Other `nodes` than in the last call begin another table. The next window has the former nodes again.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn refine_table(&mut self, tracer: &D::Tracer<'_>, nodes: [usize; 3], most: usize) -> Result<bool, DeviceError> {
+        let (mut table, nodes) = match self.finer.take() {
+            Some((table, begun)) if begun == nodes => (table, begun),
+            _ => (D::untraced_table(tracer, nodes)?, nodes),
+        };
+        let is_complete = D::trace_more(tracer, &mut table, most)?;
+        if is_complete {
+            (self.table, self.table_nodes) = (Some(table), nodes);
+        } else {
+            self.finer = Some((table, nodes));
+        }
+        Ok(is_complete)
     }
 
     /// The table, if there is one.
@@ -260,8 +293,8 @@ impl<D: SurrogateDevice> Hybrid<D> {
         let opened = Checkpoint::open(path, self.name())?;
         let mut expected = self.trainer.as_ref().map_or(Ok(0), |trainer| trainer.checkpoint_values(opened.header()))?;
         if self.kind != Kind::Network {
-            opened.header().expect_note("table.nodes", &format!("{:?}", self.nodes))?;
-            expected += self.nodes.iter().product::<usize>();
+            opened.header().expect_note("table.nodes", &format!("{:?}", self.table_nodes))?;
+            expected += self.table_nodes.iter().product::<usize>();
         }
         let checkpoint = opened.read(expected)?;
         let lost = |source| CheckpointError::Lost { path: path.into(), what: "the present table", source };
@@ -293,6 +326,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         training: impl FnOnce(HostNetwork) -> E::Training,
     ) -> Result<Hybrid<E>, DeviceError> {
         let trainer = self.trainer.as_mut().map(|trainer| trainer.moved(from, training)).transpose()?;
-        Ok(Hybrid { kind: self.kind, nodes: self.nodes, table: None, trainer, shrinkage: self.shrinkage, slid: self.slid })
+        let Self { kind, nodes, shrinkage, slid, .. } = *self;
+        Ok(Hybrid { kind, nodes, table: None, table_nodes: nodes, finer: None, trainer, shrinkage, slid })
     }
 }

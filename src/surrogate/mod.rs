@@ -252,11 +252,13 @@ pub struct SurrogateSettings {
     /// Nodes of the table along x, y, z (z ignored in two dimensions). None: the data's own nodes, at most 2^21 in all; for closed forms
     /// 256 along the longest edge, or 128 below a network.
     pub table_nodes: Option<[usize; 3]>,
+    /// While a smooth picture stands still, a table whose nodes are not set gets twice as many along each axis.
+    pub refine: bool,
 }
 
 impl Default for SurrogateSettings {
     fn default() -> Self {
-        Self { kind: Kind::Table, table_nodes: None }
+        Self { kind: Kind::Table, table_nodes: None, refine: true }
     }
 }
 
@@ -366,7 +368,7 @@ mod tests {
     #[test]
     fn a_table_over_a_globe_has_nodes_along_its_longitudes() {
         let globe = Domain { scale: [1.0, 1.0, 90.0 / 28_000.0], ..Domain::cuboid([0.0, -90.0, 1e3], [360.0, 90.0, 29e3]) };
-        let table = SurrogateSettings { kind: Kind::Table, table_nodes: None };
+        let table = SurrogateSettings::default();
         assert_eq!(table.nodes(&globe).unwrap(), [256, 128, 64], "metres are no degrees");
     }
 }

@@ -189,7 +189,7 @@ mod tests {
         let domain = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
         let most = |kind, width| {
             let network = NetworkSettings { width, log2_table: 14, ..NetworkSettings::default() };
-            Sizing::new(&SurrogateSettings { kind, table_nodes: None }, &network, &domain).unwrap().most
+            Sizing::new(&SurrogateSettings { kind, ..SurrogateSettings::default() }, &network, &domain).unwrap().most
         };
         // 2^12 entries are doubled twice; width 64 is reached at size 3; the plain table has 2^15 nodes. Nothing is tried that changes nothing.
         assert_eq!((most(Kind::Network, 16), most(Kind::Network, 64), most(Kind::Table, 64)), (2, 3, PLAIN + MAX_OWN_NODES.ilog2() - 15));

@@ -6,7 +6,7 @@ use super::network::Field;
 use super::trace::Trace;
 use rayon::prelude::*;
 use ridgewatch_base::DeviceError;
-use ridgewatch_field::{DomainPoint, UnitPoint};
+use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, Traced};
 use std::sync::Arc;
 use wide::{f32x8, i32x8};
@@ -21,25 +21,33 @@ pub struct Table {
     dimensions: usize,
     /// Values at the nodes, x fastest. Clones share them; a slide allocates new memory if a clone exists.
     values: Arc<Vec<f32>>,
+    /// Nodes that are traced, from the first on.
+    traced: usize,
     not_finite: usize,
 }
 
 impl Table {
-    /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
+    /// Creates a table none of whose nodes is traced yet. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
+    pub fn untraced(domain: &Domain, nodes: [usize; 3]) -> Self {
+        let dimensions = domain.dimensions.clamp(2, 3);
+        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
+        Self { nodes, dimensions, values: Arc::default(), traced: 0, not_finite: 0 }
+    }
+
+    /// Traces every node of a new table, as for [`Table::untraced`].
     ///
     /// # Errors
     /// The tracer's device fails.
     pub fn trace(tracer: &dyn Trace, nodes: [usize; 3]) -> Result<Self, DeviceError> {
-        let dimensions = tracer.flow().domain().dimensions.clamp(2, 3);
-        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut table = Self { nodes, dimensions, values: Arc::default(), not_finite: 0 };
-        table.retrace(tracer)?;
+        let mut table = Self::untraced(tracer.flow().domain(), nodes);
+        table.trace_more(tracer, usize::MAX)?;
         Ok(table)
     }
 
     /// Creates a table from values that were traced on a device, x fastest.
     pub fn from_values(nodes: [usize; 3], values: Vec<f32>, not_finite: usize) -> Self {
-        Self { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: Arc::new(values), not_finite }
+        let (dimensions, traced) = (if nodes[2] > 1 { 3 } else { 2 }, values.len());
+        Self { nodes, dimensions, values: Arc::new(values), traced, not_finite }
     }
 
     /// Traces every node again, after the window has slid.
@@ -47,6 +55,15 @@ impl Table {
     /// # Errors
     /// The tracer's device fails; values are then unspecified.
     pub fn retrace(&mut self, tracer: &dyn Trace) -> Result<(), DeviceError> {
+        (self.traced, self.not_finite) = (0, 0);
+        self.trace_more(tracer, usize::MAX).map(drop)
+    }
+
+    /// Traces the next nodes, at most `most`. True once every node is traced.
+    ///
+    /// # Errors
+    /// The tracer's device fails; values are then unspecified.
+    pub fn trace_more(&mut self, tracer: &dyn Trace, most: usize) -> Result<bool, DeviceError> {
         let (nodes, dimensions, domain) = (self.nodes, self.dimensions, tracer.flow().domain());
         let unit = |index: usize| -> UnitPoint {
             let node = [index % nodes[0], index / nodes[0] % nodes[1], index / (nodes[0] * nodes[1])];
@@ -54,14 +71,14 @@ impl Table {
             UnitPoint(std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 }))
         };
         let mut traced = Traced::default();
-        self.not_finite = 0;
         let all = nodes.iter().product();
         if Arc::get_mut(&mut self.values).is_none_or(|values| values.len() != all) {
             // A frame still renders with the old values, so the new ones get their own memory.
             self.values = Arc::new(vec![0.0; all]);
         }
-        for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
-            let first = part * TRACE_AT_ONCE;
+        let end = all.min(self.traced.saturating_add(most));
+        for values in Arc::make_mut(&mut self.values)[self.traced..end].chunks_mut(TRACE_AT_ONCE) {
+            let first = self.traced;
             let seeds: Vec<DomainPoint> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
             tracer.trace(&seeds, Extras::default(), &mut traced)?;
             for (value, &traced) in values.iter_mut().zip(&traced.log_stretch) {
@@ -69,8 +86,9 @@ impl Table {
                 *value = if traced.is_finite() { traced } else { 0.0 };
                 self.not_finite += usize::from(!traced.is_finite());
             }
+            self.traced += values.len();
         }
-        Ok(())
+        Ok(self.traced == all)
     }
 
     /// Nodes along x, y, z.
@@ -142,7 +160,8 @@ impl Table {
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
         let values = Arc::new(checkpoint.finite_values("table.values", self.nodes.iter().product())?);
-        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values, not_finite: checkpoint.number("table.not_finite")? })
+        let (traced, not_finite) = (values.len(), checkpoint.number("table.not_finite")?);
+        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values, traced, not_finite })
     }
 }
 

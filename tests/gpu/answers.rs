@@ -48,7 +48,7 @@ struct Stage {
 }
 
 fn table_of(host: &dyn Trace, nodes: [usize; 3]) -> HostSurrogate {
-    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes), ..SurrogateSettings::default() };
     build(&settings, &NetworkSettings::default(), host.flow().domain(), 5, host).unwrap()
 }
 

@@ -11,7 +11,7 @@ fn on_device(tracer: &CudaTracer, nodes: [usize; 3]) -> Hybrid<OnGpu> {
 }
 
 fn on_host(source: &VelocitySource, map: &FlowMap, nodes: [usize; 3]) -> HostSurrogate {
-    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+    let settings = SurrogateSettings { table_nodes: Some(nodes), ..SurrogateSettings::default() };
     let tracer = cpu_tracer(source.clone(), map, 0.0).unwrap();
     build(&settings, &NetworkSettings::default(), &domain(source), 5, &tracer).unwrap()
 }
@@ -104,4 +104,28 @@ fn a_table_of_a_run_stays_on_the_device() {
         // Seven interpolations between values of up to 5, each rounded once or, where the CPU does not fuse, twice.
         assert!(there.iter().zip(&here).all(|(a, b)| (a - b).abs() <= 5e-6), "on the device and on the host");
     }
+}
+
+/// A finer table, traced in parts beside a frame's work, is the same as one that is traced at once, and the next window has the former nodes.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_table_is_refined_part_by_part() {
+    let (gpu, map) = (gpu(), FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) });
+    let source = turbulence([40, 24, 24], 5);
+    let tracer = |t0: f64| CudaTracer::new(store(), &gpu, source.clone(), &map, t0, Tuning::default()).unwrap();
+    let (few, many) = ([40, 24, 24], [79, 47, 47]);
+    let here = tracer(0.0);
+    let mut table = on_device(&here, few);
+    let coarse = values(&table);
+    let mut parts = 1;
+    while !table.refine_table(&here, many, 50_000).unwrap() {
+        assert_eq!(values(&table).values(), coarse.values(), "frames are drawn with the present table meanwhile");
+        parts += 1;
+    }
+    assert!(parts > 3, "{parts} parts");
+    assert_eq!(table.table_nodes(), Some(many));
+    let expected = DeviceTable::trace(here.device(), &domain(&source), many).unwrap();
+    assert_eq!(values(&table).values(), expected.values().unwrap());
+    table.window_slid(&tracer(1.0)).unwrap();
+    assert_eq!(values(&table).nodes(), few);
 }

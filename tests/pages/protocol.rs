@@ -51,7 +51,7 @@ fn the_page_names_all_that_a_checkpoint_holds_and_nothing_else() {
     let frequency = NetworkSettings { encoding: Encoding::Frequency, ..hash.clone() };
     let (mut tensors, mut notes, mut shapes) = (BTreeSet::new(), BTreeSet::new(), Vec::new());
     for (kind, network) in [(Kind::Table, &hash), (Kind::Residual, &hash), (Kind::Network, &start), (Kind::Network, &frequency)] {
-        let settings = SurrogateSettings { kind, table_nodes: Some([5, 4, 2]) };
+        let settings = SurrogateSettings { kind, table_nodes: Some([5, 4, 2]), ..SurrogateSettings::default() };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
         surrogate.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(3, 100), false)), f64::INFINITY, 1).unwrap();
         let path = folder.path().join("checkpoint");

@@ -225,7 +225,9 @@ fn what_is_chosen_is_in_the_summary_with_its_reason_and_can_be_given() {
     let settings: Vec<&str> = open.iter().map(|[setting, ..]| setting.as_str()).collect();
     assert_eq!(settings, ["time.tau", "surrogate.table_nodes", "transfer.low", "transfer.high", "flow.steps"], "{open:?}");
     // Two nodes a pixel along x, and both ends.
-    assert!(open[1][1].starts_with("[65,") && open[1][2].starts_with("two a pixel"), "{open:?}");
+    assert!(open[1][1].starts_with("[129,") && open[1][2].starts_with("two a pixel"), "{open:?}");
+    // Sixteen samples a pixel in a single frame are worth a finer table.
+    assert!(open[1][2].contains("cells of [65, 53, 1] halved after 0 frames of slide 0"), "{open:?}");
     assert!(open.iter().all(|[.., why]| why.bytes().any(|c| c.is_ascii_digit()) || why.contains("median")), "{open:?}");
     let keys = ["time.tau=6 days", "surrogate.table_nodes=[32, 16, 1]", "transfer.low=0", "transfer.high=1e-5", "flow.steps=40"];
     assert_eq!(decisions("given", &keys), Vec::<[String; 3]>::new());

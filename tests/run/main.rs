@@ -12,6 +12,7 @@ mod messages;
 mod movie;
 #[path = "../network_support/mod.rs"]
 mod network_support;
+mod refine;
 mod scene_file;
 mod stated_error;
 mod steps;

@@ -15,7 +15,14 @@ fn settings(rate: Option<f32>) -> NetworkSettings {
 }
 
 fn network(tracer: &DoubleGyre, rate: Option<f32>) -> HostSurrogate {
-    build(&SurrogateSettings { kind: Kind::Network, table_nodes: None }, &settings(rate), &tracer.domain, 5, tracer).unwrap()
+    build(
+        &SurrogateSettings { kind: Kind::Network, table_nodes: None, ..SurrogateSettings::default() },
+        &settings(rate),
+        &tracer.domain,
+        5,
+        tracer,
+    )
+    .unwrap()
 }
 
 fn size(samples: &Samples) -> f64 {

@@ -23,6 +23,12 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+/// Largest number of nodes of a refined table, 1 GiB, and the share of the free memory that it takes at most.
+const MOST_REFINED_NODES: usize = 1 << 28;
+const REFINED_SHARE: u64 = 4;
+/// Nodes of a finer table that are traced for every sample of a frame: neighbouring nodes trace far faster than the queries of a frame.
+const NODES_PER_SAMPLE: usize = 64;
+
 /// A picture of the CUDA backend.
 pub struct CudaPicture {
     /// Accumulates where the placement puts frames on the CPU.
@@ -200,6 +206,18 @@ impl Backend for Cuda {
         Ok(Some(format!("the CPU renders the frames from now on and the GPU traces for them: {shortage}")))
     }
 
+    fn most_refined_nodes(&self) -> usize {
+        let share = self.gpu.memory_left() / REFINED_SHARE / size_of::<f32>() as u64;
+        match self.placement.frames {
+            Place::Device => MOST_REFINED_NODES.min(share as usize),
+            Place::Host => crate::MOST_REFINED_NODES,
+        }
+    }
+
+    fn nodes_per_sample(&self) -> usize {
+        if self.placement.frames == Place::Device { NODES_PER_SAMPLE } else { crate::NODES_PER_SAMPLE }
+    }
+
     fn when_lost(&self) -> WhenLost {
         self.device.when_lost
     }
@@ -296,6 +314,15 @@ impl Surrogate for CudaSurrogate {
             Self::Resident(hybrid) => hybrid.window_slid(tracer),
             Self::OnHost(hybrid) => hybrid.window_slid(&Interruptible::new(tracer, stop)),
         }
+    }
+    fn refine_table(&mut self, tracer: &CudaTracer, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
+        match self {
+            Self::Resident(hybrid) => hybrid.refine_table(tracer, nodes, most),
+            Self::OnHost(hybrid) => hybrid.refine_table(&Interruptible::new(tracer, stop), nodes, most),
+        }
+    }
+    fn table_nodes(&self) -> Option<[usize; 3]> {
+        either!(CudaSurrogate, self, hybrid => hybrid.table_nodes())
     }
     fn release(&mut self) -> Result<(), DeviceError> {
         match self {

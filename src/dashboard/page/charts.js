@@ -3,8 +3,8 @@ import uPlot from "./vendor/uPlot.esm.js";
 import { termButton } from "./terms.js";
 import { DASH, lag, number, percent, shareOfPeak } from "./words.js";
 
-const STAGES = ["render", "trace", "predict", "audit", "train", "checkpoint", "slide"];
-const COLOURS = ["--blue", "--orange", "--green", "--purple", "--vermillion", "--sky", "--yellow"];
+const STAGES = ["render", "trace", "predict", "audit", "train", "checkpoint", "slide", "refine"];
+const COLOURS = ["--blue", "--orange", "--green", "--purple", "--vermillion", "--sky", "--yellow", "--muted"];
 
 const pick = (value) => (Number.isFinite(value) ? value : null);
 

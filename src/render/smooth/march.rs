@@ -191,7 +191,7 @@ impl Medium<'_> {
 #[cfg(test)]
 mod tests {
     use super::offsets;
-    use crate::smooth::{AUDIT_RAYS, AuditedPixel, MIN_RAYS, MarchControl};
+    use crate::smooth::{AUDIT_RAYS, AuditedPixel, MIN_RAYS, MarchControl, ToneMap};
 
     const AUDITED: [u64; 4] = [4, 8, 12, 16];
 
@@ -219,7 +219,7 @@ mod tests {
             let rays = MIN_RAYS * (number as u64 + 1);
             if let Some(audit) = audits.get(number) {
                 control.rays = rays;
-                audit.iter().for_each(|pixel| control.audit(pixel));
+                audit.iter().for_each(|pixel| control.audit(pixel, ToneMap::new([1.0, 0.5, 1.0])));
             }
             control.rays = rays;
             [control.error(), *found]

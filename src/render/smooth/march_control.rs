@@ -1,6 +1,7 @@
 //! How finely a picture is marched: its error is measured on random pixels and kept well below that of the picture.
 
-use super::statement::LIT;
+use super::statement::{LIT, MarchError};
+use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
 /// Rays come two by two, on opposite sides of the pixel's centre.
@@ -21,7 +22,7 @@ const MIN_AUDITS: u64 = 4;
 /// Pixels per audit. Most of the error is at edges, in few of them.
 const AUDITED_PIXELS: u64 = 1024;
 /// Rays of an audit that follow those it compares. They share no coordinate with them, so that edges along the axes show too.
-pub const AUDIT_RAYS: u64 = 16;
+pub const AUDIT_RAYS: u64 = 32;
 /// Steps of an audit in one step of the march.
 pub const AUDIT_STEPS: u64 = 4;
 /// Number of lit pixels of an audit in which the depth to the light is marched, which takes long.
@@ -70,13 +71,39 @@ impl Mean {
         self.count += 1.0;
     }
 
-    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low. A single value is its own
-    /// standard error.
+    fn mean(&self) -> f64 {
+        self.sum / self.count.max(1.0)
+    }
+
+    /// Standard error of the mean. A single value is its own standard error.
+    fn deviation(&self) -> f64 {
+        let (n, mean) = (self.count, self.mean());
+        if n > 1.0 { ((self.squares / n - mean * mean).max(0.0) / (n - 1.0)).sqrt() } else { mean.abs() }
+    }
+
+    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low.
     fn bound(&self) -> f64 {
-        let n = self.count.max(1.0);
-        let mean = self.sum / n;
-        let variance = if n > 1.0 { (self.squares / n - mean * mean).max(0.0) / (n - 1.0) } else { mean * mean };
-        mean + variance.sqrt()
+        self.mean() + self.deviation()
+    }
+}
+
+/// Sums of squared differences in the weightings of [`super::TileErrors`]: their ratios turn a mean square error into a weighted one.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Weighted([f64; 3]);
+
+impl Weighted {
+    fn add(&mut self, tone_map: ToneMap, shown: [f64; 3], truth: [f64; 3]) {
+        for (shown, truth) in shown.into_iter().zip(truth) {
+            let square = (shown - truth).powi(2);
+            let toned = square * f64::from(tone_map.secant(shown as f32, truth as f32)).powi(2);
+            for (sum, value) in self.0.iter_mut().zip([square, square / (shown * shown + 0.01), toned]) {
+                *sum += value;
+            }
+        }
+    }
+
+    fn of(&self, squared: f64) -> [f64; 3] {
+        if self.0[0] > 0.0 { self.0.map(|sum| squared * sum / self.0[0]) } else { [squared; 3] }
     }
 }
 
@@ -94,6 +121,9 @@ pub struct MarchControl {
     steps: Mean,
     light: Mean,
     both: Mean,
+    /// Weights of the pixel filter's error and of that of the steps.
+    filter_weights: Weighted,
+    steps_weights: Weighted,
     /// Number of audits so far.
     audits: u64,
 }
@@ -111,8 +141,19 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        let none = Mean::default();
-        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, filter: none, steps: none, light: none, both: none, audits: 0 }
+        let (none, unweighted) = (Mean::default(), Weighted::default());
+        Self {
+            rays: 0,
+            next_rays: MIN_RAYS,
+            step: FIRST_STEP,
+            filter: none,
+            steps: none,
+            light: none,
+            both: none,
+            filter_weights: unweighted,
+            steps_weights: unweighted,
+            audits: 0,
+        }
     }
 }
 
@@ -148,8 +189,8 @@ impl MarchControl {
         (0..AUDITED_PIXELS).map(pixel).collect()
     }
 
-    /// Takes in an audited pixel, if it is lit.
-    pub fn audit(&mut self, pixel: &AuditedPixel) {
+    /// Takes in an audited pixel, if it is lit. `tone_map` is that of the picture.
+    pub fn audit(&mut self, pixel: &AuditedPixel, tone_map: ToneMap) {
         if !pixel.is_lit() {
             return;
         }
@@ -158,6 +199,8 @@ impl MarchControl {
         // The rays that follow err too: by at least this share of the error of the first, if errors fall no faster than with the square of the number.
         let (filter, rays) = (minus(pixel.first, pixel.following), self.audited_rays() as f64);
         self.filter.add(rays * dot(filter, filter) / (1.0 + (rays / AUDIT_RAYS as f64).powi(2)));
+        self.filter_weights.add(tone_map, pixel.first, pixel.following);
+        self.steps_weights.add(tone_map, pixel.pair, pixel.fine);
         let steps = minus(pixel.pair, pixel.fine);
         self.steps.add(dot(steps, steps));
         if let Some(lit) = pixel.lit {
@@ -180,6 +223,14 @@ impl MarchControl {
     /// Mean square error of marching, mean over channels.
     pub fn error(&self) -> f64 {
         self.quadrature() + self.filter()
+    }
+
+    /// Mean square errors of marching, in all weightings.
+    pub fn errors(&self) -> MarchError {
+        let [quadrature, filter] = [self.steps_weights.of(self.quadrature()), self.filter_weights.of(self.filter())];
+        let of_quadrature = [self.steps, self.light, self.both].map(|mean| mean.deviation().powi(2)).iter().sum::<f64>();
+        let of_filter = (self.filter.deviation() / self.rays.max(1) as f64).powi(2);
+        MarchError { squared: std::array::from_fn(|w| quadrature[w] + filter[w]), deviation: (of_quadrature + of_filter).sqrt() }
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.

@@ -112,7 +112,8 @@ impl Picture {
         self.settle(scene, frame.inverse_tau, round.nodes, round.number);
         let frame = &FrameScene { random: FrameRandom::new(scene.seed, self.number), ..*frame };
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
-        let mut marching = self.march(&medium, round);
+        let tone_map = ToneMap::new(scene.settings.tone_map);
+        let mut marching = self.march(&medium, tone_map, round);
         let sampling = Instant::now();
         let Some(mut stats) = self.sample(&medium, round, wave_flights, answers) else { return self.stopped() };
         let allowed = sampling.elapsed().as_secs_f64().max(MIN_MARCH_SECONDS);
@@ -140,7 +141,7 @@ impl Picture {
                 }
                 Marching::More => {}
             }
-            marching += self.march(&medium, round);
+            marching += self.march(&medium, tone_map, round);
         };
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
@@ -153,7 +154,7 @@ impl Picture {
     }
 
     /// Marches more rays, and compares some pixels with a finer march. Returns the seconds that it took. `stop` ends it early.
-    fn march(&mut self, medium: &Medium<'_>, round: &Refinement<'_>) -> f64 {
+    fn march(&mut self, medium: &Medium<'_>, tone_map: ToneMap, round: &Refinement<'_>) -> f64 {
         if !self.march.is_due() {
             return 0.0;
         }
@@ -201,7 +202,7 @@ impl Picture {
             let to_light = ToLight::March(step / LIGHT_STEPS as f32);
             audited.lit = Some(mean(0..PAIR, &|j| medium.ray(*pixel, j, fine, to_light, false)).0);
         });
-        compared.iter().for_each(|pixel| self.march.audit(pixel));
+        compared.iter().for_each(|pixel| self.march.audit(pixel, tone_map));
         began.elapsed().as_secs_f64()
     }
 
@@ -286,7 +287,7 @@ impl Picture {
         let march = self.march.error();
         // A pixel without pairs shows the march of the surrogate.
         let unbiased = how == Correction::Summed && self.sums.iter().all(|sums| sums.pairs() > 0);
-        let error = PictureError { unbiased, ..PictureError::of(&tiles, march, samples_per_pixel, self.march.rays) };
+        let error = PictureError { unbiased, ..PictureError::of(&tiles, &self.march.errors(), samples_per_pixel, self.march.rays) };
         let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
         let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };
         film.error = smoothed(&mean, width, ERROR_RADIUS).into_iter().map(|e| (e.max(floor) + march as f32).sqrt()).collect();

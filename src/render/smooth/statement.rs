@@ -25,6 +25,27 @@ impl ErrorEstimate {
     }
 }
 
+/// Mean square error of marching over lit pixels and channels.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct MarchError {
+    /// In the weightings of [`TileErrors`]: the mean over audited pixels and its standard error, added up.
+    pub squared: [f64; 3],
+    /// Standard error, without weights.
+    pub deviation: f64,
+}
+
+impl MarchError {
+    /// Adds the error of marching, `share` of that of the lit pixels, to another mean square error. Its own interval reaches two standard errors from its
+    /// mean.
+    fn added_to(&self, other: ErrorEstimate, weighting: usize, share: f64) -> ErrorEstimate {
+        let [linear, squared] = [self.squared[0], share * self.squared[weighting]];
+        let deviation = if linear > 0.0 { self.deviation * squared / linear } else { 0.0 };
+        let value = other.value + squared;
+        let (below, above) = ((other.value - other.low).hypot(3.0 * deviation), (other.high - other.value).hypot(deviation));
+        ErrorEstimate { value, low: (value - below).max(0.0), high: value + above }
+    }
+}
+
 /// Stated error of a picture, against the picture of the traced field without noise.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PictureError {
@@ -123,26 +144,23 @@ impl PictureError {
         [self.rms, self.relmse, self.psnr, self.psnr_all].iter().all(|e| e.value.is_finite() && e.low.is_finite() && e.high.is_finite())
     }
 
-    /// Error of a picture from its tiles and the mean square error of its march.
-    pub fn of(tiles: &[TileSums], march: f64, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
-        let lit = |weighting: usize| estimate(tiles.iter().map(|tile| &tile.lit), weighting);
-        let linear = lit(0);
-        // The error of marching is measured without weights and counts in proportion.
-        let with_march = |e: ErrorEstimate| {
-            let known = linear.value > 0.0 && linear.value.is_finite();
-            let share = if known { march * e.value / linear.value } else { march };
-            e.map(|v| v + share)
-        };
+    /// Error of a picture from its tiles and the error of its march.
+    pub fn of(tiles: &[TileSums], march: &MarchError, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
+        let lit = |weighting: usize| march.added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting, 1.0);
+        let pixels = |of: fn(&TileSums) -> f32| tiles.iter().map(|tile| f64::from(of(tile))).sum::<f64>();
+        // Pixels that are not lit have hardly any of it.
+        let share_lit = pixels(|tile| tile.lit.pixels) / pixels(|tile| tile.all.pixels).max(1.0);
+        let all = march.added_to(estimate(tiles.iter().map(|tile| &tile.all), 2), 2, share_lit);
         let decibels = |e: ErrorEstimate| {
             let e = e.map(|mse| -10.0 * mse.max(1e-12).log10());
             ErrorEstimate { value: e.value, low: e.high, high: e.low }
         };
         Self {
-            rms: with_march(linear).map(f64::sqrt),
-            relmse: with_march(lit(1)),
-            psnr: decibels(with_march(lit(2))),
-            psnr_all: decibels(with_march(estimate(tiles.iter().map(|tile| &tile.all), 2))),
-            march_rms: march.sqrt(),
+            rms: lit(0).map(f64::sqrt),
+            relmse: lit(1),
+            psnr: decibels(lit(2)),
+            psnr_all: decibels(all),
+            march_rms: march.squared[0].sqrt(),
             unbiased: false,
             samples_per_pixel,
             rays_per_pixel,

@@ -47,6 +47,15 @@ impl SurrogateDevice for OnGpu {
         Ok(CudaTable::new(DeviceTable::trace(tracer.device(), tracer.host().domain(), nodes)?))
     }
 
+    fn untraced_table(tracer: &CudaTracer, nodes: [usize; 3]) -> Result<CudaTable, DeviceError> {
+        Ok(CudaTable::new(DeviceTable::untraced(tracer.device().gpu(), tracer.host().domain(), nodes)?))
+    }
+
+    fn trace_more(tracer: &CudaTracer, table: &mut CudaTable, most: usize) -> Result<bool, DeviceError> {
+        let shared = || DeviceError::Unsupported { what: "tracing more nodes of a table that is in use".into() };
+        table.device.as_mut().and_then(Arc::get_mut).ok_or_else(shared)?.trace_more(tracer.device(), most)
+    }
+
     fn predict(frozen: &FrozenHybrid<Self>, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
         match frozen_parts(frozen)? {
             (Some(table), None) => predict_from_host(table.gpu(), table, points, out),

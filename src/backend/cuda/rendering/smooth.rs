@@ -13,7 +13,7 @@ use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
     AUDIT_PAIRS, AUDIT_RAYS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH,
-    MarchControl, Marching, PAIR, PictureError, TileSums,
+    MarchControl, Marching, PAIR, PictureError, TileSums, ToneMap,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
@@ -156,7 +156,7 @@ impl GpuSmooth {
             let Some(pairs) = &self.sums else { return Err(unsupported("a picture without sums")) };
             let input = CombineInput { size: [width, height], pairs, march: &self.march, how, tone_map, lit: LIT };
             let tiles = self.combine.combine(&input)?;
-            let error = PictureError::of(tiles, self.control.error(), samples_per_pixel, self.control.rays);
+            let error = PictureError::of(tiles, &self.control.errors(), samples_per_pixel, self.control.rays);
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
@@ -217,7 +217,8 @@ impl GpuSmooth {
         for (&number, rays) in lit.iter().zip(found.chunks_exact(pair)) {
             compared[number].lit = Some(mean(rays));
         }
-        compared.iter().for_each(|pixel| self.control.audit(pixel));
+        let tone_map = ToneMap::new(renderer.scene().settings.tone_map);
+        compared.iter().for_each(|pixel| self.control.audit(pixel, tone_map));
         Ok(began.elapsed().as_secs_f64())
     }
 

@@ -17,6 +17,8 @@ pub struct DeviceTable {
     gpu: Arc<Gpu>,
     frame: TableFrame,
     values: Buffer<f32>,
+    /// Seeds that are traced, in the order of the bricks.
+    traced: usize,
     not_finite: usize,
     bricks: CudaFunction,
     mend: CudaFunction,
@@ -34,8 +36,8 @@ impl DeviceTable {
     /// # Errors
     /// The table has more nodes than 32 bits can count, or the device fails or lacks memory.
     pub fn trace(tracer: &DeviceTracer, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
-        let mut table = Self::empty(tracer.gpu(), domain, nodes)?;
-        table.retrace(tracer)?;
+        let mut table = Self::untraced(tracer.gpu(), domain, nodes)?;
+        table.trace_more(tracer, usize::MAX)?;
         Ok(table)
     }
 
@@ -44,7 +46,7 @@ impl DeviceTable {
     /// # Errors
     /// As for [`Self::trace`].
     pub fn upload(gpu: &Arc<Gpu>, domain: &Domain, table: &Table) -> Result<Self, DeviceError> {
-        let mut copy = Self::empty(gpu, domain, table.nodes())?;
+        let mut copy = Self::untraced(gpu, domain, table.nodes())?;
         copy.values.write(table.values())?;
         copy.not_finite = table.not_finite();
         Ok(copy)
@@ -57,7 +59,7 @@ impl DeviceTable {
     pub(in crate::cuda) fn with_values(&self, table: &Table) -> Result<Self, DeviceError> {
         let domain =
             ridgewatch_field::Domain { dimensions: self.frame.dimensions as usize, ..ridgewatch_field::Domain::cuboid([0.0; 3], [1.0; 3]) };
-        let mut copy = Self::empty(&self.gpu, &domain, self.nodes())?;
+        let mut copy = Self::untraced(&self.gpu, &domain, self.nodes())?;
         copy.frame = self.frame;
         copy.values.write(table.values())?;
         copy.not_finite = table.not_finite();
@@ -69,8 +71,11 @@ impl DeviceTable {
         &self.gpu
     }
 
-    /// Creates a table whose values are uninitialised.
-    fn empty(gpu: &Arc<Gpu>, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
+    /// Creates a table none of whose nodes is traced yet; their values are uninitialised.
+    ///
+    /// # Errors
+    /// As for [`Self::trace`].
+    pub fn untraced(gpu: &Arc<Gpu>, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
         let dimensions = domain.dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|k| if k < dimensions { nodes[k].max(2) } else { 1 });
         let all = nodes.iter().try_fold(1usize, |all, n| all.checked_mul(*n)).filter(|all| *all < u32::MAX as usize);
@@ -80,6 +85,7 @@ impl DeviceTable {
             gpu: gpu.clone(),
             frame: TableFrame { nodes: nodes.map(|n| n as i32), dimensions: dimensions as i32, min: domain.min, extent: domain.extent() },
             values: gpu.alloc("a table", all)?,
+            traced: 0,
             not_finite: 0,
             bricks: kernel("table_bricks")?,
             mend: kernel("table_mend")?,
@@ -93,16 +99,27 @@ impl DeviceTable {
     /// # Errors
     /// The device fails or lacks memory.
     pub fn retrace(&mut self, tracer: &DeviceTracer) -> Result<(), DeviceError> {
+        self.traced = 0;
+        self.trace_more(tracer, usize::MAX).map(drop)
+    }
+
+    /// Traces the next nodes, about `most`. True once every node is traced. Waits for the result.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn trace_more(&mut self, tracer: &DeviceTracer, most: usize) -> Result<bool, DeviceError> {
         let nodes = self.frame.nodes.map(|n| n as usize);
         let [bricks_x, bricks_y, bricks_z] = nodes.map(|n| n.div_ceil(EDGE));
         let in_brick = if self.frame.dimensions == 3 { EDGE * EDGE * EDGE } else { EDGE * EDGE };
+        // Bricks at the faces reach beyond the nodes.
         let all = bricks_x * bricks_y * bricks_z * in_brick;
+        let end = all.min(self.traced.saturating_add(most));
         let stream = self.gpu.work().clone();
         let out = Outputs { log_stretch: self.values.address(), ..Outputs::default() };
         let (x, y) = (bricks_x as u32, bricks_y as u32);
-        let most = self.scratch.at_once();
-        for first in (0..all).step_by(most) {
-            let count = (all - first).min(most);
+        let at_once = self.scratch.at_once();
+        for first in (self.traced..end).step_by(at_once) {
+            let count = (end - first).min(at_once);
             let seeds = self.scratch.buffer(count)?;
             let (from, n) = (first as u64, count as u32);
             // SAFETY: arguments as declared in table.cu; `seeds` holds `count` entries, and `values` holds every node.
@@ -111,6 +128,11 @@ impl DeviceTable {
                 launch(call.arg(&self.frame).arg(&x).arg(&y).arg(&from).arg(&n).arg(&seeds), threads(count, 256))?;
                 tracer.in_sequence(seeds, count, &out)?;
             }
+        }
+        self.traced = end;
+        if end < all {
+            self.gpu.synchronize()?;
+            return Ok(false);
         }
         let values = self.values.len() as u64;
         let odd = self.gpu.upload("a counter", &[0u32])?;
@@ -124,7 +146,7 @@ impl DeviceTable {
         self.not_finite = count[0] as usize;
         // Freed until the next slide, because for a fine grid it is half as large as the table.
         self.scratch.release();
-        Ok(())
+        Ok(true)
     }
 
     /// Nodes along x, y, z.

@@ -1,0 +1,67 @@
+//! A finer table for a picture that stands still.
+
+use crate::kit::program::{config, records, set, summary, text};
+use crate::{picture, ridgewatch};
+use ridgewatch::run::FrameRecord;
+use std::path::Path;
+
+const SCENE: [&str; 5] =
+    ["source.nodes=[24, 12, 12]", "source.snapshots=14", "time.slides=2", "time.frames_per_slide=8", "time.warmup_frames=0"];
+
+/// The choice of table nodes in the summary.
+fn chosen(run: &Path) -> Vec<[String; 2]> {
+    let summary = summary(run);
+    let decisions = summary["run"]["decisions"].as_array().unwrap();
+    let of_nodes = decisions.iter().filter(|decision| decision["setting"] == "surrogate.table_nodes");
+    of_nodes.map(|decision| ["chosen", "why"].map(|key| decision[key].as_str().unwrap().to_owned())).collect()
+}
+
+fn replay(folder: &Path, name: &str, keys: &[&str]) -> (Vec<FrameRecord>, Vec<[String; 2]>) {
+    let run = folder.join(name);
+    let (scene, size, keys) = (config("turbulence_easy.toml"), picture([32, 16, 2]), set(&[&SCENE[..], keys].concat()));
+    let size: Vec<&str> = size.iter().map(String::as_str).collect();
+    ridgewatch([&["replay", &scene, "--out", text(&run), "--device", "cpu"][..], &size, &keys].concat()).success();
+    (records(&run), chosen(&run))
+}
+
+#[test]
+fn a_picture_that_stands_still_starts_anew_on_a_finer_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let (open, nodes) = replay(folder.path(), "open", &[]);
+    // 47 x 23 x 23 nodes are the work of 1.5 frames of 32 x 16 pixels with two samples, 16 nodes for each: frames 1 and 2.
+    let samples: Vec<f64> = open.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
+    assert_eq!(samples, [2.0, 4.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0].repeat(2), "each window begins with the nodes of the data");
+    let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 1e-4).collect();
+    assert_eq!(refined, [false, true, true, false, false, false, false, false].repeat(2));
+    assert!(open.iter().all(|record| record.seconds.audit >= 0.0 && record.seconds.total >= record.seconds.refine));
+    assert_eq!(nodes.len(), 1);
+    assert_eq!(nodes[0][0], "[47, 23, 23]");
+    assert!(nodes[0][1].contains("[24, 12, 12]") && nodes[0][1].contains("after 2 frames of slide 1"), "{nodes:?}");
+    for keys in [&["surrogate.refine=false"][..], &["surrogate.table_nodes=[24, 12, 12]"], &["time.frames_per_slide=4"]] {
+        let (kept, _) = replay(folder.path(), &format!("kept {}", keys[0].len()), keys);
+        let first = kept.iter().filter(|record| record.slide == 0);
+        let samples: Vec<f64> = first.map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
+        assert!(samples.windows(2).all(|pair| pair[1] == pair[0] + 2.0), "{keys:?}: {samples:?}");
+        assert!(kept.iter().all(|record| record.seconds.refine < 1e-4), "{keys:?}");
+    }
+}
+
+/// A picture of many samples in one frame begins with a table that is worth them, and is better for it.
+#[test]
+fn a_single_picture_of_many_samples_has_a_finer_table() {
+    let folder = tempfile::tempdir().unwrap();
+    let render = |name: &str, keys: &[&str]| {
+        let out = folder.path().join(name);
+        let common = ["source.nodes=[24, 12, 12]", "render.width=32", "render.height=16", "transfer.low=0.05", "transfer.high=0.25"];
+        let keys = set(&[&common[..], keys].concat());
+        let (scene, out) = (config("turbulence_easy.toml"), text(&out).to_owned());
+        ridgewatch([&["render", &scene, "--warmup", "0", "--device", "cpu", "--out", &out][..], &keys].concat()).success();
+        out
+    };
+    let truth = render("truth.exr", &["render.method=reference", "render.samples=4096"]);
+    let [coarse, fine] = [("coarse.exr", "surrogate.refine=false"), ("fine.exr", "surrogate.refine=true")]
+        .map(|(name, key)| render(name, &[key, "render.method=marched", "render.samples=64"]));
+    let psnr = |out: &str| ridgewatch(["compare", out, &truth, "--json"]).json()["psnr"].as_f64().unwrap();
+    let (coarse, fine) = (psnr(&coarse), psnr(&fine));
+    assert!(fine > coarse + 3.0, "{fine} dB, {coarse} dB with the nodes of the data");
+}
