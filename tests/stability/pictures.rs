@@ -3,7 +3,7 @@
 use crate::sweep::{rms, row};
 use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{
-    AUDIT_RAYS, AuditedPixel, LightVolume, MIN_RAYS, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight,
+    AUDIT_RAYS, AuditedPixel, LightVolume, MIN_RAYS, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight, ToneMap,
 };
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::cell::Cell;
@@ -204,7 +204,8 @@ fn few_rays_a_pixel() {
     let mut control = MarchControl::default();
     for (first, all) in first.iter().zip(&all) {
         let following = ((few + more) * all - few * first) / more;
-        control.audit(&AuditedPixel { alpha: 1.0, first: [*first; 3], following: [following; 3], ..AuditedPixel::default() });
+        let pixel = AuditedPixel { alpha: 1.0, first: [*first; 3], following: [following; 3], ..AuditedPixel::default() };
+        control.audit(&pixel, ToneMap::new([1.0, 0.5, 1.0]));
     }
     let found: Vec<(u64, f64, f64)> = [1, 2, 4, 8, 16, 32]
         .map(|rays| {
