@@ -243,8 +243,8 @@ impl SceneFile {
             (gridded, "only with snapshots; a closed form is known everywhere", &["flow.interpolation"]),
             (self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\"", &["surrogate.table_nodes"]),
             (
-                self.surrogate.kind == Kind::Table && self.surrogate.table_nodes.is_none(),
-                "only with surrogate.kind = \"table\" and without surrogate.table_nodes",
+                self.surrogate.kind == Kind::Table && self.surrogate.table_nodes.is_none() && network.size != Size::Auto,
+                "only with surrogate.kind = \"table\", without surrogate.table_nodes and with network.size = \"fixed\"",
                 &["surrogate.refine"],
             ),
             (learns || network.size == Size::Auto, LEARNS, &["network"]),

@@ -317,8 +317,11 @@ impl Surrogate for BreakingSurrogate {
     fn window_slid(&mut self, tracer: &BreakingTracer, _: &AtomicBool) -> Result<(), DeviceError> {
         self.0.window_slid(tracer)
     }
-    fn refine_table(&mut self, tracer: &BreakingTracer, nodes: [usize; 3], most: usize, _: &AtomicBool) -> Result<bool, DeviceError> {
-        self.0.refine_table(tracer, nodes, most)
+    fn refine_table(&mut self, tracer: &BreakingTracer, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
+        self.0.refine_table(tracer, nodes, most, stop)
+    }
+    fn finer_nodes(&self) -> Option<[usize; 3]> {
+        self.0.finer_nodes()
     }
     fn table_nodes(&self) -> Option<[usize; 3]> {
         self.0.table_nodes()

@@ -201,7 +201,10 @@ impl Surrogate for HostSurrogate {
         self.window_slid(&Interruptible::new(tracer, stop))
     }
     fn refine_table(&mut self, tracer: &Box<dyn Tracer>, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
-        self.refine_table(&Interruptible::new(tracer, stop), nodes, most)
+        self.refine_table(&Interruptible::new(tracer, stop), nodes, most, stop)
+    }
+    fn finer_nodes(&self) -> Option<[usize; 3]> {
+        self.finer_nodes()
     }
     fn table_nodes(&self) -> Option<[usize; 3]> {
         self.table_nodes()

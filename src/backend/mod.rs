@@ -107,7 +107,7 @@ pub trait Backend: Send + Sync + Sized {
         MOST_REFINED_NODES
     }
 
-    /// Nodes of a finer table that are traced for every sample of a frame, so that a frame takes about twice as long.
+    /// Nodes of a finer table that are traced for every sample of a frame, so that a frame of `two_level` takes about twice as long.
     fn nodes_per_sample(&self) -> usize {
         NODES_PER_SAMPLE
     }
@@ -157,9 +157,10 @@ pub trait Surrogate: Send + Sync + Sized {
     fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError>;
     /// Moves the surrogate to a new window. Setting `stop` may end the tracing of its table early; the surrogate is then unusable.
     fn window_slid(&mut self, tracer: &Self::Tracer, stop: &AtomicBool) -> Result<(), DeviceError>;
-    /// Traces about `most` further nodes of a finer table, as [`ridgewatch_surrogate::Hybrid::refine_table`] does. Setting `stop` may end it early; the
-    /// surrogate is then unusable.
+    /// Traces about `most` further nodes of a finer table, as [`ridgewatch_surrogate::Hybrid::refine_table`] does.
     fn refine_table(&mut self, tracer: &Self::Tracer, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError>;
+    /// Nodes of the finer table that is being traced; `None` if there is none.
+    fn finer_nodes(&self) -> Option<[usize; 3]>;
     /// Nodes of the table along x, y, z; `None` without a table.
     fn table_nodes(&self) -> Option<[usize; 3]>;
     /// Frees device memory before another surrogate replaces this one.

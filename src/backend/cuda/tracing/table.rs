@@ -17,7 +17,7 @@ pub struct DeviceTable {
     gpu: Arc<Gpu>,
     frame: TableFrame,
     values: Buffer<f32>,
-    /// Seeds that are traced, in the order of the bricks.
+    /// Seeds that are traced, in the order of the bricks; the maximum if the values come from elsewhere.
     traced: usize,
     not_finite: usize,
     bricks: CudaFunction,
@@ -48,7 +48,7 @@ impl DeviceTable {
     pub fn upload(gpu: &Arc<Gpu>, domain: &Domain, table: &Table) -> Result<Self, DeviceError> {
         let mut copy = Self::untraced(gpu, domain, table.nodes())?;
         copy.values.write(table.values())?;
-        copy.not_finite = table.not_finite();
+        (copy.traced, copy.not_finite) = (usize::MAX, table.not_finite());
         Ok(copy)
     }
 
@@ -62,7 +62,7 @@ impl DeviceTable {
         let mut copy = Self::untraced(&self.gpu, &domain, self.nodes())?;
         copy.frame = self.frame;
         copy.values.write(table.values())?;
-        copy.not_finite = table.not_finite();
+        (copy.traced, copy.not_finite) = (usize::MAX, table.not_finite());
         Ok(copy)
     }
 
