@@ -191,7 +191,7 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
         ("flow", "steps = 9\nintegrator = \"dormand_prince\"\nprecision = \"f64\"", "flow.steps"),
         ("flow", "interpolation = \"cubic\"", "flow.interpolation"),
         ("surrogate", "table_nodes = [8, 8, 8]\nkind = \"network\"", "surrogate.table_nodes"),
-        ("surrogate", "table_nodes = [8, 8, 8]\nrefine = true", "surrogate.refine"),
+        ("surrogate", "refine = true\ntable_nodes = [8, 8, 8]", "surrogate.refine"),
         ("network", "width = 32\n[surrogate]\nkind = \"table\"", "network.width"),
         ("training", "steps_per_frame = 9\n[surrogate]\nkind = \"table\"", "training.steps_per_frame"),
         ("training", "seconds_per_frame = 0.1\nsteps_per_frame = 9\n[surrogate]\nkind = \"residual\"", "training.seconds_per_frame"),
