@@ -75,7 +75,7 @@ impl Stop {
             let Some(first) = first else {
                 first = Some(Instant::now());
                 self.caught.store(128 + signal[0], Ordering::Relaxed);
-                self.requested.store(true, Ordering::Relaxed);
+                // Said first: a run that waits ends at once.
                 match within {
                     Some(bound) => messages::note_aside(format_args!(
                         "finishing the current frame, for {} s at most; once more to stop at once",
@@ -83,6 +83,7 @@ impl Stop {
                     )),
                     None => messages::note_aside("finishing the current frame; once more to stop at once"),
                 }
+                self.requested.store(true, Ordering::Relaxed);
                 continue;
             };
             if first.elapsed() >= ONE_STOP {

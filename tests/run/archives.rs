@@ -74,11 +74,14 @@ fn smooth_pictures_of_a_flat_archive_have_a_table_as_fine_as_they_are() {
         (summary(&run)["run"]["surrogate_bytes"].as_u64().unwrap(), records(&run)[0].picture_error.unwrap().rms.value)
     };
     // Two a pixel along 10 degrees of longitude, and in proportion along 8 of latitude.
-    let (bytes, error) = stated("fine", &[]);
+    let (bytes, error) = stated("fine", &["surrogate.refine=false"]);
     let (coarse_bytes, coarse_error) = stated("coarse", &["surrogate.table_nodes=[21, 17, 2]"]);
     assert_eq!(coarse_bytes, 21 * 17 * 4);
     assert!((97 * 70 * 4..=97 * 97 * 4).contains(&bytes), "{bytes}");
     assert!(error < 0.7 * coarse_error, "{error} {coarse_error}");
+    // Eight samples a pixel in a single frame are worth a table of four times as many nodes.
+    let (refined_bytes, _) = stated("refined", &[]);
+    assert!((193 * 139 * 4..=193 * 193 * 4).contains(&refined_bytes), "{refined_bytes}");
 }
 
 #[test]

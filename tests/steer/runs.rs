@@ -155,7 +155,7 @@ fn a_view_past_the_box_keeps_the_colours_of_its_bar() {
 /// As many samples as if the picture had begun with that camera: nothing of the former view is left in it.
 #[test]
 fn an_accumulating_picture_starts_anew_with_another_camera() {
-    let keys = "time.frames_per_slide = 8\nrender.method = \"two_level\"\n";
+    let keys = "time.frames_per_slide = 8\nrender.method = \"two_level\"\nsurrogate.refine = false\n";
     let (frames, _) = steered(scene(keys), |steering, frame| {
         if frame.record.frame == 4 {
             command(steering, json!({"camera": serde_json::from_str::<Value>(CAMERA).unwrap()}));
@@ -271,7 +271,7 @@ fn a_method_is_in_effect_on_the_next_frame() {
 
 #[test]
 fn a_budget_gives_the_next_frame_its_samples() {
-    let keys = "time.frames_per_slide = 7\nrender.method = \"two_level\"\n";
+    let keys = "time.frames_per_slide = 7\nrender.method = \"two_level\"\nsurrogate.refine = false\n";
     let (frames, _) = steered(scene(keys), |steering, frame| {
         match frame.record.frame {
             1 => command(steering, json!({"render.budget": 0.2})),
