@@ -18,6 +18,7 @@ mod refused;
 mod resampled;
 mod round_trip;
 mod terrain;
+mod unstructured;
 mod zarr;
 
 use ridgewatch::source::{Archive, ArchiveSettings, Inspection, SnapshotSource, SourceError, inspect};

@@ -24,6 +24,8 @@ struct Sea {
     /// Indices of a place.
     index: fn(f64, f64) -> [f64; 2],
     flow: fn(f64, f64) -> [f64; 2],
+    /// Each cell is two triangles of an unstructured mesh, not a part of rows and columns.
+    triangles: bool,
 }
 
 /// Eddies of 2.5 to 4 degrees.
@@ -50,6 +52,7 @@ const TURNED: Sea = Sea {
         [20.0 + (cosine * x + sine * y) / 0.4, 20.0 + (cosine * y - sine * x) / 0.4]
     },
     flow: eddies,
+    triangles: false,
 };
 
 /// Columns from 0.08 degrees in the middle to 0.5 degrees at the sides.
@@ -58,6 +61,7 @@ const STRETCHED: Sea = Sea {
     place: |i, j| [6.0 * (2.5 * (i - 30.0) / 30.0).sinh() / 2.5f64.sinh(), 0.3 * (j - 20.0)],
     index: |x, y| [30.0 + 30.0 / 2.5 * (x / 6.0 * 2.5f64.sinh()).asinh(), 20.0 + y / 0.3],
     flow: jet,
+    triangles: false,
 };
 
 /// Rows of which each lies three columns further east.
@@ -66,12 +70,37 @@ const SHEARED: Sea = Sea {
     place: |i, j| [0.3 * (i - 30.0) + 0.9 * (j - 20.0), 0.3 * (j - 20.0)],
     index: |x, y| [30.0 + (x - 3.0 * y) / 0.3, 20.0 + y / 0.3],
     flow: eddies,
+    triangles: false,
 };
 
 impl Sea {
+    /// By the UGRID conventions: values at the nodes of triangles, counted from 1.
+    fn write_triangles(&self, path: &Path, places: &[[f64; 2]]) -> PathBuf {
+        let ([nx, ny], nodes) = (self.points, places.len());
+        let cells = (0..(nx - 1) * (ny - 1)).map(|cell| cell / (nx - 1) * nx + cell % (nx - 1) + 1);
+        let corners: Vec<f64> = cells.flat_map(|n| [n, n + 1, n + nx + 1, n, n + nx + 1, n + nx]).map(|n| n as f64).collect();
+        let mut fixture = Fixture::new(NETCDF4, &[("time", 2), ("face", corners.len() / 3), ("node", nodes), ("three", 3)])
+            .axis("time", HOURS, &[0.0, HOURS_LONG])
+            .variable("face_nodes", &["face", "three"], Data::F64(corners))
+            .with("cf_role", "face_node_connectivity")
+            .with("start_index", 1);
+        for (k, (name, units)) in [("node_lon", "degrees_east"), ("node_lat", "degrees_north")].into_iter().enumerate() {
+            let values = places.iter().map(|p| MIDDLE[k] + p[k]).collect();
+            fixture = fixture.variable(name, &["node"], Data::F64(values)).with("units", units);
+        }
+        for (c, name) in ["uo", "vo"].into_iter().enumerate() {
+            let values = (0..2 * nodes).map(|n| (self.flow)(places[n % nodes][0], places[n % nodes][1])[c]).collect();
+            fixture = fixture.variable(name, &["time", "node"], f32s(values)).with("units", "m s-1").with("location", "node");
+        }
+        fixture.write(path)
+    }
+
     fn write(&self, path: &Path) -> PathBuf {
         let [nx, ny] = self.points;
         let places: Vec<[f64; 2]> = (0..nx * ny).map(|n| (self.place)((n % nx) as f64, (n / nx) as f64)).collect();
+        if self.triangles {
+            return self.write_triangles(path, &places);
+        }
         let mut fixture = Fixture::new(NETCDF4, &[("time", 2), ("y", ny), ("x", nx)]).axis("time", HOURS, &[0.0, HOURS_LONG]);
         for (k, (name, units)) in [("lon", "degrees_east"), ("lat", "degrees_north")].into_iter().enumerate() {
             let values = places.iter().map(|p| MIDDLE[k] + p[k]).collect();
@@ -85,7 +114,7 @@ impl Sea {
         fixture.write(path)
     }
 
-    /// Bilinear interpolation of the flow in the indices of the mesh; degrees from the middle.
+    /// Interpolation of the flow in the indices of the mesh, bilinear or linear in triangles; degrees from the middle.
     fn in_mesh(&self, x: f64, y: f64) -> [f64; 2] {
         let place = (self.index)(x, y);
         let low = place.map(f64::floor);
@@ -94,6 +123,10 @@ impl Sea {
             let [x, y] = (self.place)(low[0] + di, low[1] + dj);
             (self.flow)(x, y)
         };
+        if self.triangles {
+            let (side, [along, across]) = if s >= t { (at(1.0, 0.0), [s - t, t]) } else { (at(0.0, 1.0), [t - s, s]) };
+            return [0, 1].map(|c| (1.0 - along - across) * at(0.0, 0.0)[c] + along * side[c] + across * at(1.0, 1.0)[c]);
+        }
         [0, 1].map(|c| {
             (1.0 - t) * ((1.0 - s) * at(0.0, 0.0)[c] + s * at(1.0, 0.0)[c]) + t * ((1.0 - s) * at(0.0, 1.0)[c] + s * at(1.0, 1.0)[c])
         })
@@ -180,9 +213,13 @@ fn errors(sea: &Sea, archive: &mut Archive) -> [f64; 3] {
 fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
     let dir = tempdir().unwrap();
     // Beside grids of the spacing of the rows.
-    for (name, sea, coarse) in
-        [("turned", TURNED, "[0.4, 0.4]"), ("stretched", STRETCHED, "[0.3, 0.3]"), ("sheared", SHEARED, "[0.3, 0.3]")]
-    {
+    for (name, sea, coarse) in [
+        ("turned", TURNED, "[0.4, 0.4]"),
+        ("stretched", STRETCHED, "[0.3, 0.3]"),
+        ("sheared", SHEARED, "[0.3, 0.3]"),
+        ("turned, of triangles", Sea { triangles: true, ..TURNED }, "[0.4, 0.4]"),
+        ("stretched, of triangles", Sea { triangles: true, ..STRETCHED }, "[0.3, 0.3]"),
+    ] {
         let file = sea.write(&dir.path().join(format!("{name}.nc")));
         let mut refined = open(&[&file]);
         let [velocity, exact, ftle] = errors(&sea, &mut refined);

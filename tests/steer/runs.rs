@@ -384,11 +384,13 @@ fn tau_and_direction_are_in_effect_on_the_next_frame() {
         run_frames(other, &RunOptions { threads: 2, ..RunOptions::default() }, |frame| others.push(frame));
         let (one, other) = (&frames[1], &others[same]);
         assert_eq!(one.record.transfer, other.record.transfer, "{name}");
-        let furthest = |a: &Frame, b: &Frame| {
-            a.film.rgba.iter().flatten().zip(b.film.rgba.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+        let distance = |a: &Frame, b: &Frame| {
+            let squares = a.film.rgba.iter().flatten().zip(b.film.rgba.iter().flatten()).map(|(a, b)| f64::from(a - b).powi(2));
+            squares.sum::<f64>().sqrt()
         };
-        assert!(furthest(one, other) < 1e-5, "{name}: {}", furthest(one, other));
-        assert!(furthest(&frames[0], one) > 0.1, "{name}: another map is another picture");
+        // How many rays are marched in the time of a frame is up to the machine.
+        let (difference, apart) = (distance(one, other), distance(&frames[0], one));
+        assert!(difference < 0.05 * apart, "{name}: {difference}, {apart}: another map is another picture");
     }
 }
 

@@ -305,13 +305,18 @@ impl Archive {
         let Some(([nx, ny, _], zero)) = zeros.first() else { return };
         let corners = |cell: usize| [0, 1, *nx, nx + 1].map(|corner| cell / (nx - 1) * nx + cell % (nx - 1) + corner);
         let cells = nx.saturating_sub(1) * ny.saturating_sub(1);
-        let dead = (0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count();
+        // Points without rows have no cells here.
+        let (dead, of, which) = match ny {
+            1 => (zero.iter().filter(|zero| **zero).count(), zero.len(), "points"),
+            _ => ((0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count(), cells, "cells"),
+        };
         if dead > 0 {
-            let share = 100.0 * dead as f64 / cells as f64;
+            let share = 100.0 * dead as f64 / of as f64;
             self.description.notes.push(format!(
-                "the velocity is exactly 0 at all corners of {share:.1} % of the cells{}, at all of {} times: is this land? Particles rest \
+                "the velocity is exactly 0 at {}{share:.1} % of the {which}{}, at all of {} times: is this land? Particles rest \
                  there; --set archive.mask=zero takes such nodes as missing, --set archive.mask=NAME names a mask, in these files or in one \
                  that is named beside them, --set archive.mask=none keeps them",
+                if which == "cells" { "all corners of " } else { "" },
                 if self.axes.len() > 2 { " of one level" } else { "" },
                 sampled(self.times.len()).len()
             ));

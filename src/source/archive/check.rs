@@ -55,7 +55,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
     let curvilinear = matches!(layout.resampling, Some(Resampling::Curvilinear(_)));
     let what = match () {
         () if staggered => "WRF output",
-        () if curvilinear => "longitudes and latitudes of two dimensions",
+        () if curvilinear => "longitudes and latitudes of two dimensions and unstructured meshes",
         () => format.name(),
     };
     let terrain = staggered || layout.frames[0].iter().any(|component| component.columns.is_some());
@@ -71,8 +71,13 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
-        ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
-        ("grid_relative", s.grid_relative.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions and unstructured meshes only"),
+        (
+            "grid_relative",
+            s.grid_relative.is_some(),
+            curvilinear,
+            "with longitudes and latitudes of two dimensions and unstructured meshes only",
+        ),
         ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
         ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
         ("mask", s.mask.is_some(), !staggered, "left out with WRF output, whose winds blow over land too"),

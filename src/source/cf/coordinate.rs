@@ -72,13 +72,15 @@ pub fn classify(variable: &Variable) -> Kind {
 pub fn classify_name(name: &str) -> Kind {
     match name.to_ascii_lowercase().as_str() {
         "lon" | "longitude" | "longitudes" | "lons" | "nav_lon" | "rlon" | "xlong" | "grid_longitude" | "glamt" | "glamu" | "glamv"
-        | "glamf" => Kind::Longitude,
+        | "glamf" | "lonc" | "clon" | "loncell" => Kind::Longitude,
         "lat" | "latitude" | "latitudes" | "lats" | "nav_lat" | "rlat" | "xlat" | "grid_latitude" | "gphit" | "gphiu" | "gphiv"
-        | "gphif" => Kind::Latitude,
+        | "gphif" | "latc" | "clat" | "latcell" => Kind::Latitude,
         "x" | "xc" | "nx" | "easting" | "west_east" | "xu_ocean" | "xt_ocean" | "xcoor" | "x_coordinate" => Kind::X,
         "y" | "yc" | "ny" | "northing" | "south_north" | "yu_ocean" | "yt_ocean" | "ycoor" | "y_coordinate" => Kind::Y,
-        "z" | "zc" | "nz" | "lev" | "level" | "levels" | "plev" | "pressure" | "pressure_level" | "isobaric" | "depth" | "deptht"
-        | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor" => Kind::Level,
+        "z" | "zc" | "nz" | "nz1" | "lev" | "level" | "levels" | "plev" | "pressure" | "pressure_level" | "isobaric" | "depth"
+        | "deptht" | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor" => {
+            Kind::Level
+        }
         "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" | "month" | "months" => Kind::Time,
         _ => Kind::Unknown,
     }

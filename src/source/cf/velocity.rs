@@ -44,7 +44,7 @@ const STANDARD_NAMES: [[&str; 3]; 14] = [
 ];
 
 /// Usual names of one family, compared without regard to case.
-const USUAL_NAMES: [[&str; 3]; 26] = [
+const USUAL_NAMES: [[&str; 3]; 29] = [
     ["u", "v", "w"],
     ["uo", "vo", "wo"],
     ["ua", "va", "wa"],
@@ -66,6 +66,9 @@ const USUAL_NAMES: [[&str; 3]; 26] = [
     ["ugosa", "vgosa", ""],
     ["ucur", "vcur", "wcur"],
     ["ssu", "ssv", ""],
+    ["unod", "vnod", ""],
+    ["horizontalvelx", "horizontalvely", ""],
+    ["ureconstructzonal", "ureconstructmeridional", ""],
     ["uas", "vas", ""],
     ["us", "vs", ""],
     ["u10", "v10", ""],

@@ -2,6 +2,7 @@
 
 use super::mask::holds_mask;
 use super::planner::Planner;
+use super::unstructured_plan::holds_mesh;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::velocity::{Component, judge};
@@ -15,7 +16,7 @@ pub struct Content {
     pub seconds: Vec<f64>,
     /// The times, in words.
     pub when: String,
-    /// True if it holds a mask, or longitudes and latitudes of two dimensions.
+    /// True if it holds a mask, longitudes and latitudes of two dimensions, or an unstructured mesh.
     pub helps: bool,
 }
 
@@ -40,7 +41,7 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Option<Content> {
         components: variables.map(|v| v.is_some()),
         seconds: Vec::new(),
         when: String::new(),
-        helps: holds_mask(listing, settings) || pair.iter().all(Option::is_some),
+        helps: holds_mask(listing, settings) || pair.iter().all(Option::is_some) || holds_mesh(listing),
     };
     if let Some(variable) = variables.into_iter().flatten().next() {
         let mut planner = Planner::new(file, settings);

@@ -3,7 +3,7 @@
 //!
 //! Algorithm: each node of the new grid is located in a cell of the mesh, in the plane that touches the sphere at the cell (gnomonic
 //! projection). Its value is the inverse bilinear interpolation of the cell's four corners. It is missing if a corner is missing or no
-//! cell contains the node. Each horizontal component is resampled from its own points as a vector in space, along its direction
+//! cell contains the node; of points without rows, see [`super::triangles`]. Each horizontal component is resampled from its own points as a vector in space, along its direction
 //! there: east and north turn about a pole within a cell, vectors do not.
 
 use super::axes::{AxisPlan, Quantity};
@@ -52,11 +52,11 @@ impl Curvilinear {
     /// Description of the resampling.
     pub fn what(&self) -> String {
         let ([a, b], [mx, my], [nx, ny], [dx, dy]) = (&self.names, self.meshes[0].shape, self.target.nodes, self.target.step);
-        format!(
-            "`{a}` and `{b}` have two dimensions: resampled bilinearly from {mx} x {my} points to {nx} x {ny} nodes, every {dx:.4} x {dy:.4} \
-             degrees ({})",
-            self.choice
-        )
+        let from = match &self.meshes[0].triangles {
+            None => format!("have two dimensions: resampled bilinearly from {mx} x {my} points"),
+            Some(triangles) => format!("are those of a mesh without rows: resampled from {mx} points{triangles}"),
+        };
+        format!("`{a}` and `{b}` {from} to {nx} x {ny} nodes, every {dx:.4} x {dy:.4} degrees ({})", self.choice)
     }
 
     /// Longitudes and latitudes of the grid; longitudes that go round are periodic if `periodic` is set.

@@ -1,9 +1,10 @@
-//! Plan of files with longitudes and latitudes of two dimensions.
+//! Plan of files with longitudes and latitudes of two dimensions, and of [unstructured](super::unstructured_plan) meshes.
 
 use super::axes::AxisPlan;
 use super::column_plan::Terrain;
 use super::component::Role;
 use super::curvilinear::Curvilinear;
+use super::dimensions::Extent;
 use super::layout::{Layout, Resampling};
 use super::locator::{Mesh, target};
 use super::planner::Planner;
@@ -17,20 +18,34 @@ use crate::formats::Variable;
 use std::sync::Arc;
 
 /// Longitude and latitude variables.
-type Pair = [usize; 2];
+pub type Pair = [usize; 2];
 
 /// Where the points of a component lie.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Points {
-    pair: Pair,
-    /// Dimensions of the component along x and y.
-    plane: [usize; 2],
+    pub pair: Pair,
+    /// Dimensions of the component along x and y; of points without rows, their one dimension twice.
+    pub plane: [usize; 2],
     /// True along axes on which they lie between the points of the pair.
-    between: [bool; 2],
+    pub between: [bool; 2],
+    pub cells: Cells,
+}
+
+/// What lies between the points of a component. Faces are a variable of the nodes at their corners.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Cells {
+    /// Points in rows.
+    Rows,
+    /// Points of no known mesh.
+    Unknown,
+    /// The points are the nodes of faces.
+    AtNodes { faces: usize },
+    /// The points stand for faces, whose nodes have the coordinates `nodes`; their middles if these are the pair.
+    InFaces { faces: usize, nodes: Pair },
 }
 
 /// Bytes of a point of a mesh: coordinates, directions, and up to four nodes with their places, bases and velocities.
-const POINT_BYTES: u64 = 500;
+pub const POINT_BYTES: u64 = 500;
 
 impl Planner<'_> {
     /// Points of each component. `None` if the horizontal dimensions have coordinates of their own.
@@ -132,12 +147,12 @@ impl Planner<'_> {
         let on = |&[lon, _]: &Pair| {
             let plane = self.plane_of(lon);
             let own = plane.iter().all(|d| wide.contains(d));
-            own.then_some(Points { pair: [0; 2], plane, between: [false; 2] })
+            own.then_some(Points { pair: [0; 2], plane, between: [false; 2], cells: Cells::Rows })
         };
         let beside = |&[lon, _]: &Pair| {
             let more = [0, 1].map(|k| length(self.plane_of(lon)[k]) as i64 - length([x, y][k]) as i64);
             let between = more.map(|more| more == 1);
-            (more.iter().all(|more| (0..=1).contains(more))).then_some(Points { pair: [0; 2], plane: [x, y], between })
+            (more.iter().all(|more| (0..=1).contains(more))).then_some(Points { pair: [0; 2], plane: [x, y], between, cells: Cells::Rows })
         };
         let choices: [&dyn Fn(&Pair) -> Option<Points>; 2] = [&on, &beside];
         for points_of in choices {
@@ -182,24 +197,33 @@ impl Planner<'_> {
     /// Points of a component, at the first entry along all dimensions but the last two.
     fn mesh(&self, points: &Points) -> Result<Mesh, SourceError> {
         let [longitude, latitude] = points.pair;
+        if points.cells != Cells::Rows {
+            return self.unstructured_mesh(points);
+        }
         let shape = self.plane_of(longitude).map(|d| self.listing().dimensions[d].len);
         self.check_mesh(longitude)?;
-        let mut mesh = Mesh { shape, longitude: self.degrees(longitude, None)?, latitude: self.degrees(latitude, None)? };
-        if let Some(odd) = mesh.latitude.iter().find(|l| l.abs() > 90.001) {
-            return Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90, and missing values")));
-        }
+        let mut mesh = Mesh::rows(shape, self.degrees(longitude, None)?, self.degrees(latitude, None)?);
+        self.check_latitudes(latitude, &mesh.latitude)?;
         mesh.leave_out_zeros();
         Ok(mesh.between(points.between))
     }
 
-    /// Degrees at all points of a two-dimensional coordinate, or at those of one row.
-    fn degrees(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
+    /// Refuses latitudes beyond the poles.
+    pub fn check_latitudes(&self, variable: usize, latitudes: &[f64]) -> Result<(), SourceError> {
+        match latitudes.iter().find(|l| l.abs() > 90.001) {
+            Some(odd) => Err(self.misfit(variable, format!("a latitude is {odd} degrees; accepted are -90 to 90, and missing values"))),
+            None => Ok(()),
+        }
+    }
+
+    /// Degrees at all points of a coordinate, or at those of one row if it has two dimensions.
+    pub fn degrees(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
         let variable = self.variable(index);
         let mut count = self.shape(index);
         let rank = count.len();
-        count[..rank - 2].fill(1);
+        count[..rank.saturating_sub(2)].fill(1);
         let mut start = vec![0; rank];
-        if let Some(row) = row {
+        if let (Some(row), 2..) = (row, rank) {
             (start[rank - 2], count[rank - 2]) = (row, 1);
         }
         let packing = self.packing(index)?;
@@ -212,6 +236,10 @@ impl Planner<'_> {
     /// read.
     fn check_points(&self, points: &[Points], first: &Curvilinear) -> Result<(), SourceError> {
         for (points, mesh) in points.iter().zip(&first.meshes) {
+            if points.cells != Cells::Rows {
+                self.check_unstructured(points, mesh)?;
+                continue;
+            }
             let whole = if points.between == [false; 2] { None } else { Some(self.mesh(points)?) };
             let whole = [whole.as_ref().map(|mesh| &mesh.longitude), whole.as_ref().map(|mesh| &mesh.latitude)];
             for ((&index, known), whole) in points.pair.iter().zip([&mesh.longitude, &mesh.latitude]).zip(whole) {
@@ -232,13 +260,14 @@ impl Planner<'_> {
     }
 
     /// True if u and v run along the grid's own directions; and the reason.
-    fn runs_along_grid(&self, u: usize) -> (bool, String) {
+    fn runs_along_grid(&self, u: usize, cells: Cells) -> (bool, String) {
         let variable = self.variable(u);
         let standard = variable.text("standard_name").unwrap_or_default();
         let says = |text: &str| text.contains("eastward") || text.contains("zonal");
         let long = variable.text("long_name").unwrap_or_default().to_ascii_lowercase();
         match self.settings.grid_relative {
             Some(along) => (along, "as set".into()),
+            None if cells != Cells::Rows => (false, "the mesh has no rows".into()),
             None if says(standard) => (false, format!("standard_name `{standard}`")),
             None if standard.is_empty() && says(&long) => (false, format!("long_name `{long}`")),
             None if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
@@ -248,10 +277,10 @@ impl Planner<'_> {
 
     /// Plans a file whose components lie on `points`.
     pub fn plan_curvilinear(mut self, velocity: &Velocity, points: Vec<Points>, first: Option<&Layout>) -> Result<Layout, SourceError> {
-        if self.settings.region.is_some() {
-            return Err(SourceError::setting("region", "given", "left out: longitudes and latitudes of two dimensions are read whole"));
-        }
         let u = velocity.u.variable;
+        if points[0].cells != Cells::Rows && self.settings.grid_relative == Some(true) {
+            return Err(SourceError::setting("grid_relative", "true", "false: a mesh without rows has no directions of its own"));
+        }
         let planes: Vec<[usize; 2]> = points.iter().map(|points| points.plane).collect();
         let mut extents = self.extents(u)?;
         for extent in &mut extents {
@@ -260,6 +289,10 @@ impl Planner<'_> {
             }
         }
         let terrain = self.terrain(velocity, &mut extents, first)?;
+        if points[0].cells != Cells::Rows {
+            let latitude = Extent { dimension: planes[0][1], kind: Kind::Latitude, coordinate: None };
+            extents.push(latitude);
+        }
         self.name_by_position(u, &mut extents)?;
         let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
@@ -329,8 +362,8 @@ impl Planner<'_> {
             meshes.push(twin.map_or_else(|| self.mesh(own).map(Arc::new), |twin| Ok(meshes[twin].clone()))?);
         }
         let resolution = self.settings.resolution;
-        let target = target(&meshes[0], resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
-        let (along, why) = self.runs_along_grid(u);
+        let target = target(&meshes[0], resolution, self.settings.region).map_err(|what| self.misfit(points[0].pair[0], what))?;
+        let (along, why) = self.runs_along_grid(u, points[0].cells);
         let directions = std::array::from_fn(|k| meshes[k].directions(along).into_iter().map(|both| both[k]).collect());
         let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
         self.note(format!("velocities run along {which} ({why})"));

@@ -43,7 +43,7 @@ impl Planner<'_> {
     pub fn extents(&mut self, u: usize) -> Result<Vec<Extent>, SourceError> {
         let s = self.settings;
         let mut overrides = Vec::new();
-        let is_pair = self.named_pair()?.is_some();
+        let is_pair = self.named_points().is_some() || self.named_pair()?.is_some();
         for (key, name, kind) in [("x", &s.x, Kind::X), ("y", &s.y, Kind::Y), ("z", &s.z, Kind::Level), ("time", &s.time, Kind::Time)] {
             // A scalar time variable is found later.
             let variable = name.as_ref().and_then(|n| self.listing().find(n));
@@ -154,9 +154,14 @@ impl Planner<'_> {
             if found.len() > 1 || (found.is_empty() && !optional) {
                 let dims = self.listing().dimension_names(self.variable(u));
                 let which = if found.is_empty() { "no dimension".into() } else { found.join(" and ") };
-                return Err(
-                    self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with --set archive.{what}=NAME"))
-                );
+                let mesh = match (what, &found[..]) {
+                    ("y", []) => "; of points on an unstructured mesh, name the file of their longitudes and latitudes too",
+                    _ => "",
+                };
+                return Err(self.misfit(
+                    u,
+                    format!("of its dimensions ({dims}), {which} would be {what}; name it with --set archive.{what}=NAME{mesh}"),
+                ));
             }
         }
         Ok(())

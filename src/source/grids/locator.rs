@@ -1,14 +1,19 @@
 //! Locates the nodes of an even longitude-latitude grid among the cells of a mesh of points on the sphere.
 //!
-//! Algorithm: each cell is projected onto the plane that touches the sphere at its middle (gnomonic projection); the place of a node in
-//! it is the inverse of the bilinear map, by Newton's method.
+//! Algorithm: each cell of four corners is projected onto the plane that touches the sphere at its middle (gnomonic projection); the place of
+//! a node in it is the inverse of the bilinear map, by Newton's method. For triangles see [`super::triangles`].
 
-/// Points on the sphere in rows, x fastest; degrees, NaN for missing points.
+use super::triangles::{InTriangles, Triangles};
+
+/// Points on the sphere; degrees, NaN for missing points.
 #[derive(Debug)]
 pub struct Mesh {
+    /// Points along x and y, x fastest; points without rows count along x.
     pub shape: [usize; 2],
     pub longitude: Vec<f64>,
     pub latitude: Vec<f64>,
+    /// Between points without rows.
+    pub triangles: Option<Triangles>,
 }
 
 /// An even grid.
@@ -23,7 +28,7 @@ pub struct Target {
 }
 
 /// Index of no cell.
-const NOWHERE: u32 = u32::MAX;
+pub const NOWHERE: u32 = u32::MAX;
 /// Largest number of nodes for each point of the mesh in a grid that has not been refined: a mesh that is dense in one place must not
 /// exhaust the memory.
 const MAX_NODES: usize = 4;
@@ -33,14 +38,23 @@ const MAX_PLACES: [f64; 2] = [65_536.0, 16.0];
 const GOLDEN: f64 = 0.618_033_988_749_895;
 /// Extent of a mesh in degrees (0.1 m) below which it has no cells: a grid on it would have steps of 0.
 const MIN_EXTENT: f64 = 1e-6;
+/// Degrees of longitude above which the curvature of a cell's sides counts.
+const WIDE: f64 = 5.0;
 /// Largest number of columns that a mesh repeats at its seam.
 const MAX_REPEATED: usize = 4;
 /// Largest distance outside a cell, in units of the cell, at which a node still counts as inside: rounding must not open seams.
-const SLACK: f64 = 1e-7;
+pub const SLACK: f64 = 1e-7;
 
-/// Bilinear interpolation from a mesh to a grid.
+/// Interpolation from a mesh to a grid.
 #[derive(Debug)]
-pub struct Locator {
+pub enum Locator {
+    Rows(InRows),
+    Triangles(InTriangles),
+}
+
+/// Bilinear interpolation between points in rows.
+#[derive(Debug)]
+pub struct InRows {
     shape: [usize; 2],
     /// Lower corner of the cell of each node of the grid.
     cell: Vec<u32>,
@@ -48,15 +62,27 @@ pub struct Locator {
     place: Vec<[f32; 2]>,
 }
 
-type Vector = [f64; 3];
+pub type Vector = [f64; 3];
 
-fn dot(a: Vector, b: Vector) -> f64 {
+pub fn dot(a: Vector, b: Vector) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn vector(longitude: f64, latitude: f64) -> Vector {
+pub fn vector(longitude: f64, latitude: f64) -> Vector {
     let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
     [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+}
+
+/// Longitude and latitude of a direction.
+pub fn degrees(v: Vector) -> [f64; 2] {
+    [v[1].atan2(v[0]).to_degrees(), v[2].atan2(v[0].hypot(v[1])).to_degrees()]
+}
+
+/// The middle of points. `None` if they lie on all sides of the globe.
+fn middle(points: &[Vector]) -> Option<Vector> {
+    let sum: Vector = std::array::from_fn(|k| points.iter().map(|v| v[k]).sum());
+    let length = dot(sum, sum).sqrt();
+    (length >= 0.5 * points.len() as f64).then(|| sum.map(|v| v / length))
 }
 
 /// East and north at a point.
@@ -76,6 +102,10 @@ fn turn(degrees: f64) -> f64 {
 }
 
 impl Mesh {
+    pub fn rows(shape: [usize; 2], longitude: Vec<f64>, latitude: Vec<f64>) -> Self {
+        Self { shape, longitude, latitude, triangles: None }
+    }
+
     /// Takes points at longitude 0 and latitude 0 as missing if there are several: models write them where nothing was computed.
     pub fn leave_out_zeros(&mut self) {
         let nowhere: Vec<usize> = (0..self.longitude.len()).filter(|&n| self.longitude[n] == 0.0 && self.latitude[n] == 0.0).collect();
@@ -102,21 +132,25 @@ impl Mesh {
                     let own = vector(self.longitude[n], self.latitude[n]);
                     sum = std::array::from_fn(|k| sum[k] + own[k]);
                 }
-                longitude.push(sum[1].atan2(sum[0]).to_degrees());
-                latitude.push(sum[2].atan2(sum[0].hypot(sum[1])).to_degrees());
+                let middle = degrees(sum);
+                longitude.push(middle[0]);
+                latitude.push(middle[1]);
             }
         }
-        Self { shape, longitude, latitude }
+        Self::rows(shape, longitude, latitude)
     }
 
-    fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
+    pub fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
         let n = j * self.shape[0] + i;
         (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])
     }
 
-    /// Degrees between neighbouring points along x.
+    /// Degrees between neighbouring points: along x, or along all sides of triangles.
     fn spacings(&self) -> Vec<f64> {
         let [nx, ny] = self.shape;
+        if let Some(triangles) = &self.triangles {
+            return triangles.sides(self);
+        }
         let mut found = Vec::new();
         for (j, i) in (0..ny).flat_map(|j| (0..nx - 1).map(move |i| (j, i))) {
             if let (Some(a), Some(b)) = (self.point(i, j), self.point(i + 1, j)) {
@@ -127,9 +161,13 @@ impl Mesh {
     }
 
     /// Steps to the east and to the north, in degrees of a great circle, in which the indices of the mesh change by one: medians over its
-    /// cells. `None` without cells.
+    /// cells. Among triangles, the width of the area of one point. `None` without cells.
     fn steps(&self) -> Option<[f64; 2]> {
         let [nx, ny] = self.shape;
+        if let Some(triangles) = &self.triangles {
+            // Each point has the area of two triangles.
+            return median(triangles.areas(self)).map(|area| [(2.0 * area).sqrt(); 2]);
+        }
         let mut found = [Vec::new(), Vec::new()];
         for (j, i) in (0..ny - 1).flat_map(|j| (0..nx - 1).map(move |i| (j, i))) {
             let (Some(p), Some(q), Some(r)) = (self.point(i, j), self.point(i + 1, j), self.point(i, j + 1)) else { continue };
@@ -204,12 +242,13 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-/// An even grid that covers a mesh, in steps of `resolution` degrees or of the mesh's own ([`Mesh::steps`]).
+/// An even grid that covers a mesh, or the part of it in `region` (west, east, south, north), in steps of `resolution` degrees or of the mesh's own
+/// ([`Mesh::steps`]).
 ///
 /// # Errors
-/// A mesh without cells, a resolution out of range, or too many nodes.
-pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, String> {
-    if mesh.shape.iter().any(|&n| n < 2) {
+/// A mesh without cells, a resolution out of range, a region beside the mesh, or too many nodes.
+pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>, region: Option<[f64; 4]>) -> Result<Target, String> {
+    if mesh.triangles.is_none() && mesh.shape.iter().any(|&n| n < 2) {
         return Err(format!("{:?} points make no cell", mesh.shape));
     }
     if let Some(odd) = resolution.and_then(|r| r.into_iter().find(|r| !(*r > 0.0 && *r <= 45.0))) {
@@ -217,9 +256,9 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
     }
     let known: Vec<[f64; 2]> =
         (0..mesh.longitude.len()).map(|n| [mesh.longitude[n], mesh.latitude[n]]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
-    let Some(along_x) = median(mesh.spacings()) else { return Err("no two neighbouring points differ".into()) };
+    let Some(along_x) = median(mesh.spacings()) else { return Err("no two neighbouring points differ: they make no cell".into()) };
     let latitudes: Vec<f64> = known.iter().map(|p| p[1]).collect();
-    let (south, north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
+    let (mut south, mut north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
     let mut middle = latitudes;
     middle.sort_by(f64::total_cmp);
     if north - south <= MIN_EXTENT {
@@ -238,20 +277,41 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
             (start, hole) = (pair[1], pair[1] - pair[0]);
         }
     }
-    let round = hole < 2.0 * step[0].max(along_x / cosine);
+    let mut round = hole < 2.0 * step[0].max(along_x / cosine);
     if round {
         start = 0.0;
     } else if start > 180.0 && start + 360.0 - hole > 360.0 {
         start -= 360.0;
     }
-    let width = if round { 360.0 } else { 360.0 - hole };
+    let mut width = if round { 360.0 } else { 360.0 - hole };
     if width <= MIN_EXTENT {
         return Err(format!("its points lie on one meridian, at {start} degrees east: they make no cell"));
+    }
+    let mut most = MAX_NODES as f64 * known.len().max(64) as f64;
+    if let Some([west, east, low, high]) = region {
+        let all = width * (north - south);
+        let ends = format!("{start} to {} degrees east and from {south} to {north} degrees north", start + width);
+        (south, north) = (south.max(low), north.min(high));
+        let wanted = (east - west).rem_euclid(360.0);
+        let wanted = if wanted == 0.0 { 360.0 } else { wanted };
+        let from = (west - start).rem_euclid(360.0);
+        if round {
+            round = wanted == 360.0;
+            (start, width) = (if round { start } else { west }, wanted);
+        } else {
+            // The part that begins within the mesh, or the one that reaches it from the west.
+            let (begin, end) = if from < width { (from, (from + wanted).min(width)) } else { (0.0, (from + wanted - 360.0).min(width)) };
+            (start, width) = (start + begin, end - begin);
+        }
+        if width <= MIN_EXTENT || north - south <= MIN_EXTENT {
+            return Err(format!("the region [{west}, {east}, {low}, {high}] lies beside it: it reaches from {ends}"));
+        }
+        most = (most * width * (north - south) / all).max(64.0);
     }
     loop {
         let across = ((width / step[0]).round() as usize).max(1);
         let up = (((north - south) / step[1]).round() as usize).max(1);
-        if resolution.is_none() && across.saturating_mul(up) > MAX_NODES * known.len().max(64) {
+        if resolution.is_none() && across.saturating_mul(up) as f64 > most {
             step = step.map(|s| s * 1.25);
             continue;
         }
@@ -327,8 +387,94 @@ impl Target {
     }
 }
 
+impl Target {
+    /// Calls `visit` with the nodes of the grid, and their directions, in a box around a few corners of a cell.
+    pub fn around(&self, corners: &[[f64; 2]], mut visit: impl FnMut(usize, Vector)) {
+        let mut vectors = [[0.0; 3]; 4];
+        let vectors = &mut vectors[..corners.len()];
+        vectors.iter_mut().zip(corners).for_each(|(v, c)| *v = vector(c[0], c[1]));
+        let Some([longitude, latitude]) = middle(vectors).map(degrees) else { return };
+        let mut low = [f64::INFINITY; 2];
+        let mut high = [f64::NEG_INFINITY; 2];
+        let mut reach = |place: [f64; 2]| {
+            for (k, value) in [turn(place[0] - longitude), place[1]].into_iter().enumerate() {
+                (low[k], high[k]) = (low[k].min(value), high[k].max(value));
+            }
+            high[0] - low[0]
+        };
+        let wide = corners.iter().map(|&corner| reach(corner)).fold(0.0, f64::max);
+        // The sides are curved in longitude and latitude.
+        if wide > WIDE {
+            for (a, b) in vectors.iter().enumerate().flat_map(|(k, a)| vectors[..k].iter().map(move |b| (a, b))) {
+                for share in [0.25, 0.5, 0.75] {
+                    reach(degrees(std::array::from_fn(|k| (1.0 - share) * a[k] + share * b[k])));
+                }
+            }
+        }
+        for k in 0..2 {
+            let more = 0.1 * (high[k] - low[k]);
+            (low[k], high[k]) = (low[k] - more, high[k] + more);
+        }
+        let pole_inside = high[0] - low[0] > 180.0;
+        if pole_inside {
+            if latitude > 0.0 { high[1] = 90.0 } else { low[1] = -90.0 }
+        }
+        let row = |l: f64| (l - self.first[1]) / self.step[1];
+        let rows =
+            row(low[1]).ceil().max(0.0) as usize..=(row(high[1]).floor().max(-1.0) as i64).min(self.nodes[1] as i64 - 1).max(-1) as usize;
+        if row(high[1]) < 0.0 {
+            return;
+        }
+        // The longitudes of a grid that ends lie within a turn of its first one; those of a cell at that end may lie on either side of it.
+        let east = (longitude - self.first[0]).rem_euclid(360.0);
+        let columns = self.nodes[0] as i64;
+        let ends: &[f64] = if self.round || pole_inside { &[0.0] } else { &[0.0, 360.0] };
+        let span = |back: &f64| {
+            let column = |l: f64| (l + east - back) / self.step[0];
+            let (first, last) = (column(low[0]).ceil() as i64, column(high[0]).floor() as i64);
+            match () {
+                () if pole_inside => 0..=columns - 1,
+                () if self.round => first..=last,
+                () => first.max(0)..=last.min(columns - 1),
+            }
+        };
+        for y in rows {
+            for x in ends.iter().flat_map(span) {
+                let column = x.rem_euclid(columns);
+                let place = [self.first[0] + self.step[0] * column as f64, self.first[1] + self.step[1] * y as f64];
+                visit(y * self.nodes[0] + column as usize, vector(place[0], place[1]));
+            }
+        }
+    }
+}
+
 impl Locator {
     pub fn new(mesh: &Mesh, target: &Target) -> Self {
+        match &mesh.triangles {
+            Some(triangles) => Self::Triangles(InTriangles::new(mesh, triangles, target)),
+            None => Self::Rows(InRows::new(mesh, target)),
+        }
+    }
+
+    /// Points of the mesh.
+    pub fn points(&self) -> usize {
+        match self {
+            Self::Rows(rows) => rows.shape[0] * rows.shape[1],
+            Self::Triangles(triangles) => triangles.points,
+        }
+    }
+
+    /// Values at the nodes of the grid; NaN outside all cells and if a corner is missing.
+    pub fn apply(&self, values: &[f32]) -> Vec<f32> {
+        match self {
+            Self::Rows(rows) => rows.apply(values),
+            Self::Triangles(triangles) => triangles.apply(values),
+        }
+    }
+}
+
+impl InRows {
+    fn new(mesh: &Mesh, target: &Target) -> Self {
         let [nx, ny] = mesh.shape;
         let mut this = Self {
             shape: mesh.shape,
@@ -351,79 +497,25 @@ impl Locator {
     /// Locates the grid's nodes in one cell.
     fn fill(&mut self, index: u32, corners: [[f64; 2]; 4], target: &Target) {
         let vectors = corners.map(|c| vector(c[0], c[1]));
-        let sum: Vector = std::array::from_fn(|k| vectors.iter().map(|v| v[k]).sum());
-        let length = dot(sum, sum).sqrt();
-        // Corners on all sides of the globe make no cell.
-        if length < 2.0 {
-            return;
-        }
-        let middle = sum.map(|v| v / length);
-        let (longitude, latitude) = (middle[1].atan2(middle[0]).to_degrees(), middle[2].clamp(-1.0, 1.0).asin().to_degrees());
+        let Some(middle) = middle(&vectors) else { return };
+        let [longitude, latitude] = degrees(middle);
         let [east, north] = east_north(longitude, latitude);
         let project = |v: Vector| {
             let ahead = dot(v, middle);
             (ahead > 0.1).then(|| [dot(v, east) / ahead, dot(v, north) / ahead])
         };
-        let flat = vectors.map(project);
-        let [Some(a), Some(b), Some(c), Some(d)] = flat else { return };
-        let mut low = [f64::INFINITY; 2];
-        let mut high = [f64::NEG_INFINITY; 2];
-        for corner in corners {
-            for (k, value) in [turn(corner[0] - longitude), corner[1]].into_iter().enumerate() {
-                (low[k], high[k]) = (low[k].min(value), high[k].max(value));
+        let [Some(a), Some(b), Some(c), Some(d)] = vectors.map(project) else { return };
+        target.around(&corners, |node, p| {
+            if self.cell[node] == NOWHERE
+                && let Some(place) = project(p).and_then(|p| inside([a, b, c, d], p))
+            {
+                self.cell[node] = index;
+                self.place[node] = place.map(|s| s as f32);
             }
-        }
-        // The sides are curved in longitude and latitude.
-        for k in 0..2 {
-            let more = 0.1 * (high[k] - low[k]);
-            (low[k], high[k]) = (low[k] - more, high[k] + more);
-        }
-        let pole_inside = high[0] - low[0] > 180.0;
-        if pole_inside {
-            if latitude > 0.0 { high[1] = 90.0 } else { low[1] = -90.0 }
-        }
-        let row = |l: f64| (l - target.first[1]) / target.step[1];
-        let rows =
-            row(low[1]).ceil().max(0.0) as usize..=(row(high[1]).floor().max(-1.0) as i64).min(target.nodes[1] as i64 - 1).max(-1) as usize;
-        if row(high[1]) < 0.0 {
-            return;
-        }
-        // The longitudes of a grid that ends lie within a turn of its first one; those of a cell at that end may lie on either side of it.
-        let east = (longitude - target.first[0]).rem_euclid(360.0);
-        let columns = target.nodes[0] as i64;
-        let ends: &[f64] = if target.round || pole_inside { &[0.0] } else { &[0.0, 360.0] };
-        let span = |back: &f64| {
-            let column = |l: f64| (l + east - back) / target.step[0];
-            let (first, last) = (column(low[0]).ceil() as i64, column(high[0]).floor() as i64);
-            match () {
-                () if pole_inside => 0..=columns - 1,
-                () if target.round => first..=last,
-                () => first.max(0)..=last.min(columns - 1),
-            }
-        };
-        for y in rows {
-            for x in ends.iter().flat_map(span) {
-                let column = x.rem_euclid(columns);
-                let node = y * target.nodes[0] + column as usize;
-                if self.cell[node] != NOWHERE {
-                    continue;
-                }
-                let p = vector(target.first[0] + target.step[0] * column as f64, target.first[1] + target.step[1] * y as f64);
-                if let Some(place) = project(p).and_then(|p| inside([a, b, c, d], p)) {
-                    self.cell[node] = index;
-                    self.place[node] = place.map(|s| s as f32);
-                }
-            }
-        }
+        });
     }
 
-    /// Points of the mesh.
-    pub fn points(&self) -> usize {
-        self.shape[0] * self.shape[1]
-    }
-
-    /// Values at the nodes of the grid; NaN outside all cells and if a corner is missing.
-    pub fn apply(&self, values: &[f32]) -> Vec<f32> {
+    fn apply(&self, values: &[f32]) -> Vec<f32> {
         let nx = self.shape[0];
         let one = |(&cell, &[s, t]): (&u32, &[f32; 2])| {
             if cell == NOWHERE {
@@ -476,13 +568,13 @@ mod tests {
                 latitude.push(50.0 + sine * x + cosine * y);
             }
         }
-        Mesh { shape: [n, n], longitude, latitude }
+        Mesh::rows([n, n], longitude, latitude)
     }
 
     #[test]
     fn smooth_fields_survive() {
         let mesh = turned(25.0, 41);
-        let target = target(&mesh, None).unwrap();
+        let target = target(&mesh, None, None).unwrap();
         assert!(!target.round && target.nodes.iter().all(|&n| n > 20 && n < 80), "{target:?}");
         let locator = Locator::new(&mesh, &target);
         let field = |lon: f64, lat: f64| (lon * 0.3).sin() + 0.1 * lat;
@@ -513,7 +605,7 @@ mod tests {
             let known = |east: f64| {
                 let mut mesh = turned(25.0, 41);
                 mesh.longitude.iter_mut().for_each(|l| *l = turn(*l + east));
-                let target = target(&mesh, Some([resolution; 2])).unwrap();
+                let target = target(&mesh, Some([resolution; 2]), None).unwrap();
                 Locator::new(&mesh, &target).apply(&vec![1.0; 41 * 41]).iter().filter(|v| v.is_finite()).count()
             };
             // Rounding may decide for nodes on the rim.
@@ -526,7 +618,7 @@ mod tests {
         // Of a mesh whose rows run north, 3 degrees apart in columns of 1 degree, on the equator; and of one whose rows lie 5 columns further east.
         let mesh = |place: fn(f64, f64) -> [f64; 2]| {
             let points: Vec<[f64; 2]> = (0..25).map(|n| place(f64::from(n % 5) - 2.0, f64::from(n / 5) - 2.0)).collect();
-            Mesh { shape: [5, 5], longitude: points.iter().map(|p| p[0]).collect(), latitude: points.iter().map(|p| p[1]).collect() }
+            Mesh::rows([5, 5], points.iter().map(|p| p[0]).collect(), points.iter().map(|p| p[1]).collect())
         };
         for (place, east, north) in [
             ((|i, j| [-0.01 * j, 0.03 * i]) as fn(f64, f64) -> [f64; 2], 0.01, 0.03),
@@ -541,7 +633,7 @@ mod tests {
     fn a_mesh_without_width_is_refused() {
         let line = |longitude: fn(f64) -> f64, latitude: fn(f64) -> f64| {
             let at = |f: fn(f64) -> f64| (0..9).map(|n| f(f64::from(n))).collect();
-            target(&Mesh { shape: [3, 3], longitude: at(longitude), latitude: at(latitude) }, Some([0.5, 0.5]))
+            target(&Mesh::rows([3, 3], at(longitude), at(latitude)), Some([0.5, 0.5]), None)
         };
         // Along a meridian, the one at 180 degrees, a parallel, and a closed parallel.
         for (longitude, latitude, word) in [
@@ -568,8 +660,8 @@ mod tests {
                 latitude.push(90.0 - x.hypot(y));
             }
         }
-        let mesh = Mesh { shape: [n, n], longitude, latitude };
-        let target = target(&mesh, Some([5.0, 1.0])).unwrap();
+        let mesh = Mesh::rows([n, n], longitude, latitude);
+        let target = target(&mesh, Some([5.0, 1.0]), None).unwrap();
         assert!(target.round);
         let locator = Locator::new(&mesh, &target);
         let ones = locator.apply(&vec![1.0; n * n]);

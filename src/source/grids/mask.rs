@@ -137,7 +137,7 @@ fn fit(listing: &Listing, mask: &Variable, plan: &ComponentPlan) -> Option<Vec<A
         found.push(along);
     }
     found.reverse();
-    (taken[0] && taken[1]).then_some(found)
+    (taken[0] && (taken[1] || plan.along(1) == 1)).then_some(found)
 }
 
 /// A mask that may be used: the lower the rank, the better it fits.

@@ -4,8 +4,8 @@
 //! the components of one time on the grid. Calls `formats` (requests only) and `cf`. Knows no file format: it distinguishes only
 //! files that name their dimensions from files that do not.
 //!
-//! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan`, `staggered_plan` (WRF) and `datasets` (no named
-//! dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation), and `refine` chooses
+//! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan` (also of unstructured meshes, whose points `unstructured_plan`
+//! finds and `triangles` connects), `staggered_plan` (WRF) and `datasets` (no named dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation), and `refine` chooses
 //! how fine the grid of `curvilinear_plan` is.
 
 mod axes;
@@ -31,6 +31,8 @@ mod refine;
 mod staggered;
 mod staggered_plan;
 mod times;
+mod triangles;
+mod unstructured_plan;
 mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};

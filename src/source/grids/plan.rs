@@ -22,6 +22,8 @@ pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>)
     components.into_iter().flatten().try_for_each(|c| planner.check_extents(c.variable))?;
     if planner.is_staggered(&velocity) {
         planner.plan_staggered(&velocity, first)
+    } else if let Some(points) = planner.unstructured_points(&velocity)? {
+        planner.plan_curvilinear(&velocity, points, first)
     } else if let Some(points) = planner.curvilinear_points(&velocity)? {
         planner.plan_curvilinear(&velocity, points, first)
     } else {

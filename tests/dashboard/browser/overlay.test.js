@@ -45,6 +45,13 @@ const drawn = (page, pixels) => page.evaluate((at) => {
   return { text: document.getElementById("overlay-text").textContent, hidden: canvas.hidden, size: [canvas.width, canvas.height], colours: at.map(([x, y]) => [...context.getImageData(x, y, 1, 1).data]) };
 }, pixels);
 
+/** Text, plane and scale of the overlay, of one moment. */
+const shownNow = (page) => page.evaluate(() => ({
+  told: document.getElementById("overlay-text").textContent,
+  hidden: document.getElementById("overlay").hidden || document.getElementById("overlay-scale").hidden,
+  ticks: document.querySelectorAll("#overlay-scale .ticks span").length,
+}));
+
 /** The channel of these pixels of a frame, and null if the run keeps another frame by now. */
 async function channels(name, frame, pixels) {
   const address = new URL(shown.url);
@@ -108,7 +115,11 @@ test("the key goes through the layers, each said with its frame and scale, and f
     await until(`the words of ${of}`, async () => words.test(await text(page)));
     const first = await text(page);
     await until("a later frame", async () => (await text(page)) !== first && words.test(await text(page)));
-    assert.ok((await page.isVisible("#overlay")) && (await page.locator("#overlay-scale .ticks span").count()) > 2);
+    // Frames go on: text, plane and scale are looked at in one moment.
+    await until(`the plane and scale of ${of}`, async () => {
+      const { told, hidden, ticks } = await shownNow(page);
+      return words.test(told) && !hidden && ticks >= 2;
+    });
     const [frame, over] = [await page.locator("#frame").boundingBox(), await page.locator("#overlay").boundingBox()];
     assert.deepEqual(over, frame);
   }
