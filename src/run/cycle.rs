@@ -600,6 +600,9 @@ impl<B: Backend> Cycle<'_, B> {
             });
             drop(slide);
             let next = slides.next_slide(self.run.stop)?;
+            if next.is_none() {
+                self.run.progress.warnings.extend(slides.warnings());
+            }
             check_stop(self.run.stop)?;
             let Some(next) = next else { return Ok(()) };
             (slide, begun) = (next, Instant::now());

@@ -9,7 +9,8 @@ use crate::progress;
 use crate::setting::{Refused, shown};
 use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
-    Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
+    Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, follow,
+    read_ahead,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -56,9 +57,14 @@ pub trait Slides: Send {
         None
     }
 
-    /// For a running simulation, true until the next window is complete. `None` for other sources.
+    /// For a running simulation and an archive that is followed, true until the next window is complete. `None` for other sources.
     fn is_awaited(&self) -> Option<bool> {
         None
+    }
+
+    /// Warnings since the last slide, after which the source has ended.
+    fn warnings(&mut self) -> Vec<String> {
+        Vec::new()
     }
 
     /// Whether no further slide is given, whatever the source does.
@@ -160,6 +166,8 @@ impl Slides for ClosedForm {
 struct ArchiveSlides {
     /// Read ahead by one I/O thread.
     reader: ReadAhead,
+    /// Further snapshots may come.
+    follows: bool,
     /// Dates by time.
     dates: Vec<(f64, Option<String>)>,
     window: Window,
@@ -181,6 +189,9 @@ impl Slides for ArchiveSlides {
         let Self { reader, window, taken, .. } = self;
         while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
             let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
+            let arrived = reader.arrived();
+            self.dates.extend(arrived.dates);
+            warnings.extend(arrived.warnings);
             let newest = window.newest();
             match window.push(snapshot?) {
                 Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
@@ -214,8 +225,23 @@ impl Slides for ArchiveSlides {
         self.direction = direction;
     }
 
+    fn warnings(&mut self) -> Vec<String> {
+        self.reader.arrived().warnings
+    }
+
+    fn is_awaited(&self) -> Option<bool> {
+        self.follows.then(|| self.reader.is_followed() && self.reader.remaining() == 0)
+    }
+
+    fn is_over(&self) -> bool {
+        self.count.is_over()
+    }
+
     fn expected(&self) -> Option<u64> {
         let times = &self.dates;
+        if self.follows {
+            return Some(self.count.most).filter(|n| *n < u64::MAX);
+        }
         let first = times.iter().position(|(t, _)| t - times[0].0 >= self.window.span() * (1.0 - 1e-9))?;
         Some(self.count.most.min(((times.len() - 1 - first) / self.stride + 1) as u64))
     }
@@ -285,11 +311,18 @@ pub(super) fn open_slides(
             Ok(Box::new(ClosedForm { flow, domain, start: scene.time.start, step: scene.time.seed_step, count: Count::new(scene, 1) }))
         }
         (None, Some(source)) => {
-            source.check_tau(tau)?;
+            let longest = scene.archive.follow.filter(|_| scene.source.kind == SourceKind::Archive).map(Duration::from_secs_f64);
+            if longest.is_none() {
+                source.check_tau(tau)?;
+            }
             let dates: Vec<_> = source.times().iter().map(|&t| (t, source.date(t))).collect();
             let range = 0..dates.len();
             Ok(Box::new(ArchiveSlides {
-                reader: read_ahead(source, range, DEFAULT_READ_AHEAD),
+                reader: match longest {
+                    Some(longest) => follow(source, DEFAULT_READ_AHEAD, longest),
+                    None => read_ahead(source, range, DEFAULT_READ_AHEAD),
+                },
+                follows: longest.is_some(),
                 dates,
                 window: Window::new(tau),
                 direction,

@@ -191,6 +191,8 @@ pub struct ArchiveSettings {
     pub select: Option<BTreeMap<String, usize>>,
     /// Units of `u`, `v`, `w`, `x`, `y`, `z` or `time` where those of the files are missing or wrong.
     pub units: Option<BTreeMap<String, String>>,
+    /// `replay` waits for further snapshots at the end of the files, and ends after so many seconds without one; by default it ends at once.
+    pub follow: Option<f64>,
     /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
     pub external: bool,
     /// Most memory that reading may need, in GiB; by default nine tenths of what is free.

@@ -23,8 +23,8 @@ mod snapshots;
 mod source_settings;
 
 pub use archive::{
-    Archive, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead, ResamplingReport,
-    ResolutionReport, Steady, TimeReport, VariableReport, expand, inspect, read_ahead, synthesize,
+    Archive, Arrived, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead,
+    ResamplingReport, ResolutionReport, Steady, TimeReport, VariableReport, expand, follow, inspect, read_ahead, synthesize,
 };
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use cf::calendar::utc;
@@ -32,5 +32,5 @@ pub use error::SourceError;
 pub use formats::{FormatError, FormatFault, hdf5_version, is_url, netcdf_version, report_crashes};
 pub use georeference::{Coordinate, Georeference, GridMapping, MappingValue, Positions};
 pub use grids::{FileOrder, InFile};
-pub use snapshots::{Listener, SnapshotSource, SourceDescription, StillReading, TimeGap, window_snapshots};
+pub use snapshots::{Listener, News, SnapshotSource, SourceDescription, StillReading, TimeGap, window_snapshots};
 pub use source_settings::{DomainSettings, SourceKind, SourceSettings};

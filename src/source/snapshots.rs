@@ -29,6 +29,11 @@ pub trait SnapshotSource: Send {
     /// An index beyond the last snapshot; a file that was removed, changed or is damaged.
     fn read(&mut self, index: usize) -> Result<Snapshot, SourceError>;
 
+    /// Looks for snapshots that have come since the source was opened, or since the last look; they follow the others.
+    fn look(&mut self) -> News {
+        News::default()
+    }
+
     /// A time as a date (`2002-01-01T00:00:00Z`); `None` without a calendar.
     fn date(&self, _time: f64) -> Option<String> {
         None
@@ -93,6 +98,15 @@ pub trait SnapshotSource: Send {
             times => Ok((span(times), median_interval(times))),
         }
     }
+}
+
+/// What a look for further snapshots found.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct News {
+    /// Times of the new snapshots, ascending.
+    pub times: Vec<f64>,
+    /// What was found and not taken, each said once.
+    pub warnings: Vec<String>,
 }
 
 /// Description of a source, for logs and summaries.

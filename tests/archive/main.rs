@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
 mod curvilinear;
+mod followed;
 mod grib;
 mod hdf5;
 mod hemispheres;

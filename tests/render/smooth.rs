@@ -131,6 +131,22 @@ fn deviations(found: &Film, truth: &Film, variance: impl Fn(usize) -> f64) -> (f
     (f64::sqrt(square / count), most)
 }
 
+/// A finer table answers for the same view: with as many rays as before, the picture becomes no coarser.
+#[test]
+fn other_nodes_get_as_many_rays_as_those_before() {
+    let domain = slab();
+    let scene = scene(&domain, 48, false, oblique());
+    let of = |p: DomainPoint| 0.6 + 0.3 * (9.0 * p.0[0]).sin() * (7.0 * p.0[1]).cos();
+    let mut smooth = Smooth::new(&scene, &domain);
+    let coarse = nodes(&domain, [17, 17, 2], of);
+    let how = (Method::Marched, false, 0.25);
+    let rays =
+        (0..40).map(|_| smooth.round(&coarse, None, how, of).1.rays_per_pixel).find(|rays| *rays > 4).expect("rays come with rounds");
+    let finer = nodes(&domain, [33, 33, 2], of);
+    let first = smooth.round(&finer, None, how, of).1;
+    assert!(first.rays_per_pixel >= rays && first.samples_per_pixel < 1.0, "{first:?}, {rays} rays before");
+}
+
 #[test]
 fn a_marched_picture_is_the_mean_of_tracked_ones() {
     for (what, domain, orthographic, light) in [

@@ -5,8 +5,10 @@ use crate::kit::program::{self, config, records, run, set, summary, text};
 use crate::kit::scene;
 use crate::{picture, ridgewatch};
 use ridgewatch::run::FrameRecord;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 /// Replays with small pictures into the folder `out`; the result must be exit status 0.
 fn replay(scene: &str, out: &Path, options: &[&str]) -> program::Outcome {
@@ -16,7 +18,11 @@ fn replay(scene: &str, out: &Path, options: &[&str]) -> program::Outcome {
 
 /// Ten days of an eddy of about 1 m/s over 10 x 8 degrees, with a square of land (NaN) in the south-west.
 fn eddy(folder: &Path) -> PathBuf {
-    let (nt, ny, nx) = (10, 17, 21);
+    days_of_eddy(folder, "eddy.nc", 0..10)
+}
+
+fn days_of_eddy(folder: &Path, name: &str, days: Range<usize>) -> PathBuf {
+    let (nt, ny, nx) = (days.len(), 17, 21);
     let land = |y: usize, x: usize| x < 5 && y < 5;
     let component = |sign: f64, along: fn(f64, f64) -> f64| {
         f32s(fill(nt, ny, nx, move |t, y, x| {
@@ -25,7 +31,7 @@ fn eddy(folder: &Path) -> PathBuf {
         }))
     };
     let degrees = |first: f64, n: usize| (0..n).map(|i| first + 0.5 * i as f64).collect::<Vec<_>>();
-    let days: Vec<f64> = (0..nt).map(|t| t as f64).collect();
+    let days: Vec<f64> = days.map(|t| t as f64).collect();
     let (lon, lat) = (degrees(10.0, nx), degrees(-40.0, ny));
     let axes: [(&str, &str, &[f64]); 3] =
         [("time", "days since 2000-01-01", &days), ("lat", "degrees_north", &lat), ("lon", "degrees_east", &lon)];
@@ -34,7 +40,34 @@ fn eddy(folder: &Path) -> PathBuf {
         .with("standard_name", "eastward_sea_water_velocity")
         .fields("m/s", [("v", component(1.0, |east, _| east))])
         .with("standard_name", "northward_sea_water_velocity")
-        .write(&folder.join("eddy.nc"))
+        .write(&folder.join(name))
+}
+
+/// The window goes on into a file that is written while the run waits for it.
+#[test]
+fn an_archive_that_is_followed_gives_the_slides_that_come() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    std::fs::create_dir(&data).unwrap();
+    let out = folder.path().join("run");
+    days_of_eddy(&data, "first.nc", 0..4);
+    let writer = std::thread::spawn({
+        let (records, data, aside) = (out.join("records.jsonl"), data.clone(), folder.path().to_owned());
+        move || {
+            let begin = Instant::now();
+            while std::fs::read_to_string(&records).map_or(0, |text| text.lines().count()) < 2 {
+                assert!(begin.elapsed() < Duration::from_secs(120), "no frames came");
+                std::thread::sleep(Duration::from_millis(20));
+            }
+            std::fs::rename(days_of_eddy(&aside, "part", 4..8), data.join("second.nc")).unwrap();
+        }
+    });
+    let keys = set(&["time.tau=2 days", "time.slides=5", "render.method=reference"]);
+    replay(text(&data), &out, &[&["--follow=120"], &keys[..]].concat());
+    writer.join().unwrap();
+    let dates: Vec<String> = records(&out).into_iter().map(|r| r.date.unwrap()).collect();
+    assert_eq!(dates, (3..8).map(|day| format!("2000-01-{day:02}T00:00:00Z")).collect::<Vec<_>>());
+    assert_eq!(summary(&out)["run"]["slides"], 5);
 }
 
 #[test]

@@ -164,6 +164,11 @@ impl MarchControl {
         Self { step: self.step, ..Self::default() }
     }
 
+    /// The control of the same view of other nodes. It gets as many rays at once, so that the picture becomes no coarser than it was.
+    pub fn on_other_nodes(self) -> Self {
+        Self { next_rays: self.rays.clamp(MIN_RAYS, MAX_RAYS), ..self.restarted() }
+    }
+
     /// Divisor of the distances in the light volume.
     pub fn refine(&self) -> usize {
         (FIRST_STEP / self.step).round().max(1.0) as usize

@@ -80,16 +80,20 @@ pub struct Picture {
 impl Picture {
     /// Starts anew if the picture shows anything else.
     fn settle(&mut self, scene: &Scene, inverse_tau: f32, nodes: &Nodes, number: u64) {
-        let same =
-            |(shown, tau, old): &(Scene, f32, Nodes)| shown == scene && *tau == inverse_tau && std::ptr::eq(old.values(), nodes.values());
-        if self.shows.as_ref().is_some_and(same) {
-            return;
-        }
+        let march = match &self.shows {
+            Some((shown, tau, old)) if shown == scene && *tau == inverse_tau => {
+                if std::ptr::eq(old.values(), nodes.values()) {
+                    return;
+                }
+                self.march.on_other_nodes()
+            }
+            _ => self.march.restarted(),
+        };
         let (width, height) = (scene.settings.width, scene.settings.height);
         *self = Self {
             shows: Some((scene.clone(), inverse_tau, nodes.clone())),
             number,
-            march: self.march.restarted(),
+            march,
             light: None,
             base: vec![RaySum::default(); width * height],
             sums: vec![PairSums::default(); width * height],

@@ -2,6 +2,7 @@
 
 use super::check::{check, check_fit};
 use super::files::expand;
+use super::follow::Followed;
 use super::group::{Group, grouped, open_group};
 use super::limits;
 use super::synthetic::{declared, synthesized};
@@ -16,7 +17,7 @@ use crate::grids::{
     AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, VelocityScale, ZERO, difference,
     holds_mask, plan, read_component, read_levels, slab_of,
 };
-use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
+use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -25,11 +26,11 @@ use std::sync::Arc;
 const COMPONENTS: [&str; 3] = ["u", "v", "w"];
 
 /// A file of the archive, or several that are read as one; closed until it is read.
-struct ArchiveFile {
-    path: PathBuf,
+pub(super) struct ArchiveFile {
+    pub(super) path: PathBuf,
     /// With files of other components, meshes and masks.
-    group: Group,
-    frames: Vec<Vec<ComponentPlan>>,
+    pub(super) group: Group,
+    pub(super) frames: Vec<Vec<ComponentPlan>>,
 }
 
 /// Shape of each component and, for each of its points, whether the velocity is always 0.
@@ -37,20 +38,20 @@ type Zeros = Vec<([usize; 3], Vec<bool>)>;
 
 /// Place of a snapshot in the files.
 #[derive(Debug, Clone, Copy)]
-struct Place {
-    file: usize,
-    frame: usize,
-    entry: usize,
+pub(super) struct Place {
+    pub(super) file: usize,
+    pub(super) frame: usize,
+    pub(super) entry: usize,
 }
 
 /// Velocity in NetCDF files and Zarr stores with CF conventions, in WRF output, on curvilinear grids, or in HDF5 files. Opening reads
 /// headers, coordinates and times; velocities are read one snapshot at a time. One file is open at any moment.
 pub struct Archive {
-    files: Vec<ArchiveFile>,
+    pub(super) files: Vec<ArchiveFile>,
     /// In time order.
-    places: Vec<Place>,
-    seconds: Vec<f64>,
-    times: Vec<f64>,
+    pub(super) places: Vec<Place>,
+    pub(super) seconds: Vec<f64>,
+    pub(super) times: Vec<f64>,
     calendar: Option<Calendar>,
     axes: Vec<AxisPlan>,
     grid: Arc<Grid>,
@@ -63,10 +64,14 @@ pub struct Archive {
     in_cells: bool,
     georeference: Georeference,
     description: SourceDescription,
-    open: Option<(usize, DataFile)>,
+    pub(super) open: Option<(usize, DataFile)>,
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
-    limits: Limits,
+    pub(super) limits: Limits,
+    /// Layout of the first file, until `followed` takes it.
+    first: Option<Box<Layout>>,
+    /// Set if further snapshots may come.
+    pub(super) followed: Option<Followed>,
 }
 
 impl Archive {
@@ -76,7 +81,13 @@ impl Archive {
     /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
     /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each error names the file.
     pub fn open(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Self, SourceError> {
-        let mut archive = Self::open_files(files_of(paths, settings)?, settings)?;
+        let files = files_of(paths, settings)?;
+        let stamps = settings.follow.map(|_| Followed::stamps(&files)).transpose()?;
+        let mut archive = Self::open_files(files, settings)?;
+        if let Some(stamps) = stamps {
+            let paths = if paths.is_empty() { settings.files.clone() } else { paths.to_vec() };
+            archive.followed = archive.first.take().map(|first| Followed::new(paths, settings, *first, stamps));
+        }
         let synthetic = settings.synthetic.as_ref().filter(|_| paths.is_empty() && settings.files.is_empty());
         // Synthetic files of earlier versions do not declare themselves.
         if let Some(synthetic) = synthetic.filter(|_| archive.description.synthetic.is_none()) {
@@ -166,6 +177,7 @@ impl Archive {
             Metric::Sphere | Metric::Cartesian => seconds.clone(),
         };
         check_fit(settings, &layout, format)?;
+        let first = settings.follow.map(|_| Box::new(layout.clone()));
         let on_sphere = layout.axes[0].kind == Kind::Longitude && layout.axes[1].kind == Kind::Latitude;
         let scale = match (layout.metric, settings.velocity_unit) {
             (Metric::Index, VelocityUnit::Si) => Some(VelocityScale::to_cells(&layout.axes)),
@@ -212,6 +224,8 @@ impl Archive {
             expected: expected.map(|listing| listing.part(&names)),
             limits,
             files,
+            first,
+            followed: None,
         };
         if let Some(what) = synthetic {
             archive.declare_synthetic(what);
@@ -337,6 +351,11 @@ impl Archive {
     /// [`SnapshotSource::times`] except in the index metric.
     pub fn seconds(&self) -> &[f64] {
         &self.seconds
+    }
+
+    /// True if snapshots are counted from 0, instead of having times in seconds.
+    pub(super) fn is_counted(&self) -> bool {
+        self.metric == Metric::Index
     }
 
     /// Metric in force.
@@ -502,6 +521,10 @@ impl SnapshotSource for Archive {
         Ok(Snapshot::from_components(self.times[index], self.grid.clone(), &components[0], &components[1], w))
     }
 
+    fn look(&mut self) -> News {
+        self.look_for_news()
+    }
+
     fn date(&self, time: f64) -> Option<String> {
         let calendar = self.calendar?;
         if self.metric != Metric::Index {
@@ -585,7 +608,7 @@ fn in_words(group: &[PathBuf]) -> String {
 }
 
 /// Opens and plans the next group of an archive whose first file has the layout `first`.
-fn open_next(
+pub(super) fn open_next(
     group: &[PathBuf],
     settings: &ArchiveSettings,
     first: Option<&Layout>,

@@ -5,6 +5,9 @@ use crate::error::SourceError;
 use crate::formats::Format;
 use crate::grids::{Layout, Resampling};
 
+/// Longest wait for a further snapshot, in seconds: four months.
+const MOST_FOLLOWED: f64 = 1e7;
+
 /// Refuses settings that are wrong for all files.
 ///
 /// # Errors
@@ -30,6 +33,14 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
         && !(gib.is_finite() && gib > 0.0)
     {
         return fault("memory_gib", gib.to_string(), "a number above 0");
+    }
+    if let Some(follow) = settings.follow
+        && !(follow.is_finite() && follow > 0.0 && follow <= MOST_FOLLOWED)
+    {
+        return fault("follow", follow.to_string(), "seconds above 0, up to 1e7");
+    }
+    if settings.follow.is_some() && (settings.steady || settings.synthetic.is_some()) {
+        return fault("follow", "given".into(), "left out of steady flows and synthetic archives, to which no snapshots are added");
     }
     if let Some(odd) = settings.units.iter().flatten().find(|(of, _)| !WITH_UNITS.contains(&of.as_str())) {
         return fault(

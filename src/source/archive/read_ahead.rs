@@ -1,25 +1,52 @@
-//! The I/O thread, which reads ahead into a bounded channel.
+//! The I/O thread, which reads ahead into a bounded channel, and waits for further snapshots if the source is followed.
 
 use crate::error::SourceError;
 use crate::snapshots::{Listener, SnapshotSource, StillReading};
 use ridgewatch_field::Snapshot;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Default capacity of the channel.
 pub const DEFAULT_READ_AHEAD: usize = 2;
 
+/// Time between two looks for further snapshots.
+const LOOK: Duration = Duration::from_secs(1);
+/// Time within which a thread that waits notices that nobody reads any more.
+const NOTICE: Duration = Duration::from_millis(50);
+
+/// Snapshots that have come, and what was found and not taken.
+#[derive(Debug, Default, PartialEq)]
+pub struct Arrived {
+    /// Times and dates.
+    pub dates: Vec<(f64, Option<String>)>,
+    /// See [`crate::News::warnings`].
+    pub warnings: Vec<String>,
+}
+
+/// What the thread and its reader share.
+#[derive(Default)]
+struct Shared {
+    reading_nanoseconds: AtomicU64,
+    listener: OnceLock<Listener>,
+    /// Snapshots that are known.
+    count: AtomicUsize,
+    /// True while further ones may come.
+    is_followed: AtomicBool,
+    /// True once nobody reads any more.
+    is_dropped: AtomicBool,
+    /// What the looks found since it was asked for.
+    arrived: Mutex<Arrived>,
+}
+
 /// Snapshots in time order, read ahead by a thread. Dropping it ends the thread after the current read.
 pub struct ReadAhead {
     receiver: Receiver<Result<Arc<Snapshot>, SourceError>>,
     returned: usize,
-    count: usize,
     waited: Duration,
-    reading_nanoseconds: Arc<AtomicU64>,
-    listener: Arc<OnceLock<Listener>>,
+    shared: Arc<Shared>,
     /// Error of a thread that could not start; returned once.
     failed: Option<SourceError>,
     ended: bool,
@@ -28,34 +55,83 @@ pub struct ReadAhead {
 /// Starts reading snapshots `range` (clipped to the existing ones) on a thread named `ridgewatch-io`. At most `capacity` snapshots
 /// (at least one) wait in the channel; the thread holds one more. A snapshot that cannot be read yields an error, and reading
 /// continues with the next.
-pub fn read_ahead(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usize) -> ReadAhead {
-    let range = range.start..range.end.min(source.times().len());
-    let count = range.len();
+pub fn read_ahead(source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usize) -> ReadAhead {
+    start(source, range, capacity, None)
+}
+
+/// The same of all snapshots, and of those that come later: reading ends when none has come for `longest`.
+pub fn follow(source: Box<dyn SnapshotSource>, capacity: usize, longest: Duration) -> ReadAhead {
+    start(source, 0..usize::MAX, capacity, Some(longest))
+}
+
+fn start(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usize, longest: Option<Duration>) -> ReadAhead {
+    let mut range = range.start..range.end.min(source.times().len());
     let (sender, receiver) = sync_channel(capacity.max(1));
-    let reading_nanoseconds = Arc::new(AtomicU64::new(0));
-    let clock = reading_nanoseconds.clone();
-    let listener = Arc::new(OnceLock::<Listener>::new());
-    let shared = listener.clone();
+    let shared =
+        Arc::new(Shared { count: AtomicUsize::new(range.len()), is_followed: AtomicBool::new(longest.is_some()), ..Shared::default() });
+    let own = shared.clone();
+    let count = range.len();
     let work = move || {
-        for index in range {
-            let begin = Instant::now();
-            let read = source.read(index).map(Arc::new);
-            clock.fetch_add(begin.elapsed().as_nanos() as u64, Ordering::Relaxed);
-            if let (Ok(snapshot), Some(tell)) = (&read, shared.get()) {
-                tell(snapshot);
+        loop {
+            for index in range.clone() {
+                let begin = Instant::now();
+                let read = source.read(index).map(Arc::new);
+                own.reading_nanoseconds.fetch_add(begin.elapsed().as_nanos() as u64, Ordering::Relaxed);
+                if let (Ok(snapshot), Some(tell)) = (&read, own.listener.get()) {
+                    tell(snapshot);
+                }
+                // The receiver was dropped.
+                if sender.send(read).is_err() {
+                    return;
+                }
             }
-            // The receiver was dropped.
-            if sender.send(read).is_err() {
-                return;
+            match longest.and_then(|longest| own.wait_for_more(&mut *source, longest)) {
+                Some(more) => range = range.end..range.end + more,
+                None => break,
             }
         }
+        // Before the channel closes: this is an end, and no panic.
+        own.is_followed.store(false, Ordering::Release);
     };
     let failed = std::thread::Builder::new().name("ridgewatch-io".into()).spawn(work).err().map(|e| SourceError::ReaderStopped {
         index: 0,
         count,
         what: format!("it could not start: {e}"),
     });
-    ReadAhead { receiver, returned: 0, count, waited: Duration::ZERO, reading_nanoseconds, listener, failed, ended: false }
+    ReadAhead { receiver, returned: 0, waited: Duration::ZERO, shared, failed, ended: false }
+}
+
+impl Shared {
+    /// Looks for further snapshots until there are some, and returns their number; `None` after `longest`, or once nobody reads.
+    fn wait_for_more(&self, source: &mut dyn SnapshotSource, longest: Duration) -> Option<usize> {
+        let begin = Instant::now();
+        loop {
+            let found = source.look();
+            let more = found.times.len();
+            let dates = found.times.iter().map(|&time| (time, source.date(time)));
+            let mut arrived = self.arrived.lock().unwrap_or_else(PoisonError::into_inner);
+            arrived.dates.extend(dates);
+            arrived.warnings.extend(found.warnings);
+            drop(arrived);
+            if more > 0 {
+                self.count.fetch_add(more, Ordering::Release);
+                return Some(more);
+            }
+            let looked = Instant::now();
+            while looked.elapsed() < LOOK {
+                if self.is_dropped.load(Ordering::Relaxed) || begin.elapsed() >= longest {
+                    return None;
+                }
+                std::thread::sleep(NOTICE.min(longest));
+            }
+        }
+    }
+}
+
+impl Drop for ReadAhead {
+    fn drop(&mut self) {
+        self.shared.is_dropped.store(true, Ordering::Relaxed);
+    }
 }
 
 impl ReadAhead {
@@ -66,7 +142,7 @@ impl ReadAhead {
 
     /// Time that the thread has spent reading.
     pub fn reading(&self) -> Duration {
-        Duration::from_nanos(self.reading_nanoseconds.load(Ordering::Relaxed))
+        Duration::from_nanos(self.shared.reading_nanoseconds.load(Ordering::Relaxed))
     }
 
     /// The next snapshot; `None` at the end. Waits for at most `limit`.
@@ -74,7 +150,7 @@ impl ReadAhead {
     /// # Errors
     /// The snapshot is still being read: ask again.
     pub fn next_within(&mut self, limit: Duration) -> Result<Option<Result<Arc<Snapshot>, SourceError>>, StillReading> {
-        if self.remaining() == 0 {
+        if self.remaining() == 0 && !self.is_followed() {
             return Ok(None);
         }
         if let Some(error) = self.failed.take() {
@@ -90,9 +166,11 @@ impl ReadAhead {
                 Ok(Some(snapshot))
             }
             Err(RecvTimeoutError::Timeout) => Err(StillReading),
+            Err(RecvTimeoutError::Disconnected) if self.remaining() == 0 && !self.is_followed() => Ok(None),
             Err(RecvTimeoutError::Disconnected) => {
                 self.ended = true;
-                Ok(Some(Err(SourceError::ReaderStopped { index: self.returned, count: self.count, what: "it panicked".into() })))
+                let count = self.shared.count.load(Ordering::Acquire);
+                Ok(Some(Err(SourceError::ReaderStopped { index: self.returned, count, what: "it panicked".into() })))
             }
         }
     }
@@ -100,12 +178,22 @@ impl ReadAhead {
     /// Sets the listener, which is called with each snapshot before it is returned. A second call has no effect.
     pub fn tell(&self, listener: Listener) {
         // The first listener receives all snapshots already.
-        let _ = self.listener.set(listener);
+        let _ = self.shared.listener.set(listener);
     }
 
-    /// Number of snapshots still to come.
+    /// Number of snapshots still to come, of those that are known.
     pub fn remaining(&self) -> usize {
-        if self.ended { 0 } else { self.count - self.returned }
+        if self.ended { 0 } else { self.shared.count.load(Ordering::Acquire) - self.returned }
+    }
+
+    /// True while snapshots may come that are not known yet.
+    pub fn is_followed(&self) -> bool {
+        !self.ended && self.shared.is_followed.load(Ordering::Acquire)
+    }
+
+    /// What has come since this was asked last.
+    pub fn arrived(&self) -> Arrived {
+        std::mem::take(&mut *self.shared.arrived.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
@@ -128,7 +216,6 @@ mod tests {
     use super::*;
     use crate::archive::memory::MemorySource;
     use ridgewatch_field::{Axis, Geometry, Grid};
-    use std::sync::atomic::AtomicUsize;
 
     fn source(count: usize, made: Arc<AtomicUsize>, panic_at: usize) -> Box<dyn SnapshotSource> {
         let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 2).unwrap();

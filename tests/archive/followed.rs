@@ -1,0 +1,128 @@
+//! Archives to which snapshots are added while they are read.
+
+use crate::kit::netcdf::*;
+use crate::{DAYS, open_with, refused};
+use ridgewatch::source::{ReadAhead, SnapshotSource, follow};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use tempfile::tempdir;
+
+const LONGEST: Duration = Duration::from_secs(60);
+
+/// A file of these days, in which u is the day; `parts` of its components.
+fn fixture(days: &[f64], parts: &[&str]) -> Fixture {
+    let nodes = |value: &dyn Fn(f64) -> f64| f32s(days.iter().flat_map(|&day| [value(day); 12]).collect());
+    let fixture = Fixture::on(
+        CLASSIC,
+        &[("time", DAYS, days), ("lat", "degrees_north", &[10.0, 11.0, 12.0]), ("lon", "degrees_east", &[5.0, 6.0, 7.0, 8.0])],
+    );
+    parts.iter().fold(fixture, |fixture, part| {
+        let value: &dyn Fn(f64) -> f64 = if *part == "u" { &|day| day } else { &|_| 0.5 };
+        fixture.fields("m/s", [(*part, nodes(value))])
+    })
+}
+
+/// Writes beside the name first, as no reader would find it in part.
+fn put(dir: &Path, name: &str, fixture: &Fixture) -> PathBuf {
+    let part = fixture.write(&dir.join(format!("{name}.part")));
+    let whole = dir.join(name);
+    std::fs::rename(part, &whole).unwrap();
+    whole
+}
+
+/// The days of the next snapshots, by their values.
+fn next(reader: &mut ReadAhead, count: usize) -> Vec<f64> {
+    (0..count)
+        .map(|_| {
+            let snapshot = reader.next_within(LONGEST).expect("no snapshot came").expect("the archive ended").unwrap();
+            let node = snapshot.nodes[5];
+            let speed = (0..3).map(|k| f64::from(node[k]).powi(2)).sum::<f64>().sqrt();
+            (speed * speed - 0.25).sqrt().round()
+        })
+        .collect()
+}
+
+fn followed(dir: &Path, pattern: &str, longest: Duration) -> ReadAhead {
+    let archive = open_with(&[dir.join(pattern)], "follow = 60\nmask = \"none\"");
+    follow(Box::new(archive), 2, longest)
+}
+
+#[test]
+fn files_that_come_and_files_that_grow_are_read_on() {
+    let dir = tempdir().unwrap();
+    put(dir.path(), "a.nc", &fixture(&[1.0, 2.0], &["u", "v"]));
+    let mut reader = followed(dir.path(), "*.nc", LONGEST);
+    assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
+    // A new file, whose first time lies before the newest.
+    put(dir.path(), "b.nc", &fixture(&[1.5, 3.0, 4.0], &["u", "v"]));
+    assert_eq!(next(&mut reader, 2), [3.0, 4.0]);
+    let arrived = reader.arrived();
+    assert_eq!(
+        arrived.dates.iter().map(|(_, date)| date.clone().unwrap()).collect::<Vec<_>>(),
+        ["2000-01-04T00:00:00Z", "2000-01-05T00:00:00Z"]
+    );
+    assert!(arrived.warnings[0].contains("b.nc: 1 of its times lie before the newest"), "{:?}", arrived.warnings);
+    // The same file with two more times.
+    put(dir.path(), "b.nc", &fixture(&[1.5, 3.0, 4.0, 5.0, 6.0], &["u", "v"]));
+    assert_eq!(next(&mut reader, 2), [5.0, 6.0]);
+    assert_eq!(reader.arrived().warnings, Vec::<String>::new());
+    // What cannot be read is told once, and read when it has changed.
+    std::fs::write(dir.path().join("c.nc"), "no data yet").unwrap();
+    let begin = Instant::now();
+    let mut warnings = Vec::new();
+    while warnings.is_empty() && begin.elapsed() < LONGEST {
+        std::thread::sleep(Duration::from_millis(50));
+        warnings.extend(reader.arrived().warnings);
+    }
+    assert!(warnings.len() == 1 && warnings[0].contains("c.nc") && warnings[0].contains("not read, until it changes"), "{warnings:?}");
+    put(dir.path(), "c.nc", &fixture(&[7.0], &["u", "v"]));
+    assert_eq!(next(&mut reader, 1), [7.0]);
+    // Another grid.
+    let other =
+        Fixture::on(CLASSIC, &[("time", DAYS, &[8.0]), ("lat", "degrees_north", &[10.0, 11.0]), ("lon", "degrees_east", &[5.0, 6.0])]);
+    put(dir.path(), "d.nc", &other.winds(f32s(vec![1.0; 4]), f32s(vec![1.0; 4])));
+    put(dir.path(), "e.nc", &fixture(&[9.0], &["u", "v"]));
+    assert_eq!(next(&mut reader, 1), [9.0]);
+    let warnings = reader.arrived().warnings;
+    assert!(warnings.len() == 1 && warnings[0].contains("d.nc") && warnings[0].contains("axes"), "{warnings:?}");
+}
+
+#[test]
+fn components_in_files_of_their_own_are_read_once_all_are_there() {
+    let dir = tempdir().unwrap();
+    for part in ["u", "v"] {
+        put(dir.path(), &format!("1{part}.nc"), &fixture(&[1.0, 2.0], &[part]));
+    }
+    let mut reader = followed(dir.path(), "*.nc", LONGEST);
+    assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
+    put(dir.path(), "2u.nc", &fixture(&[3.0], &["u"]));
+    let begin = Instant::now();
+    let mut warnings = Vec::new();
+    while warnings.is_empty() && begin.elapsed() < LONGEST {
+        std::thread::sleep(Duration::from_millis(50));
+        warnings.extend(reader.arrived().warnings);
+    }
+    assert!(warnings.len() == 1 && warnings[0].contains("not read yet") && warnings[0].contains("2u.nc"), "{warnings:?}");
+    put(dir.path(), "2v.nc", &fixture(&[3.0], &["v"]));
+    assert_eq!(next(&mut reader, 1), [3.0]);
+}
+
+#[test]
+fn waiting_ends_after_the_longest_time_and_when_nobody_reads() {
+    let dir = tempdir().unwrap();
+    put(dir.path(), "a.nc", &fixture(&[1.0, 2.0], &["u", "v"]));
+    let mut reader = followed(dir.path(), "*.nc", Duration::from_millis(300));
+    assert!(reader.is_followed());
+    assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
+    let begin = Instant::now();
+    assert!(reader.next_within(LONGEST).unwrap().is_none() && !reader.is_followed());
+    assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
+    let archive = open_with(&[dir.path().join("*.nc")], "");
+    assert_eq!(archive.times().len(), 2);
+    let store = dir.path().join("x.zarr");
+    std::fs::create_dir(&store).unwrap();
+    std::fs::write(store.join(".zgroup"), "{\"zarr_format\": 2}").unwrap();
+    refused(&[store], "follow = 5", &["follow", "Zarr store", "with files"]);
+    refused(&[dir.path().join("a.nc")], "follow = 0", &["follow", "seconds above 0"]);
+    refused(&[dir.path().join("a.nc")], "follow = 5\nsteady = true", &["follow", "steady"]);
+}
