@@ -7,6 +7,7 @@ mod grib;
 mod hdf5;
 mod hemispheres;
 mod http;
+mod hybrid;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod land;

@@ -167,6 +167,130 @@ fn nodes_and_faces_of_a_basin_with_an_island() {
     check_basin("FVCOM", &mut open(&[&file]), 2e-2);
 }
 
+/// Faces in any order: the triangles do not depend on which middle comes first.
+#[test]
+fn faces_in_any_order() {
+    let dir = tempdir().unwrap();
+    let (nodes, mut faces) = basin();
+    for round in 0..4 {
+        // Steps that share no factor with the number of faces take each once.
+        let count = faces.len();
+        let step = [131, 377, 601, 997][round];
+        faces = (0..count).map(|k| faces[(k * step + 17 * round) % count]).collect();
+        let middles: Vec<[f64; 2]> = faces.iter().map(|face| middle(&nodes, face)).collect();
+        // Counted from 1, filled up by 0: one triangle has no fourth corner; the last node is in use.
+        let corners = faces
+            .iter()
+            .enumerate()
+            .flat_map(|(f, face)| (0..5).map(move |k| if k == 4 || (k == 3 && f == 7) { 0.0 } else { (face[k] + 1) as f64 }));
+        let fixture =
+            times(&[("node", nodes.len()), ("face", count), ("five", 5)]).variable("nv", &["face", "five"], Data::F64(corners.collect()));
+        let fixture = if round % 2 == 0 { fixture.with("start_index", 1) } else { fixture };
+        let fixture = coordinates(fixture, "node", ["lon", "lat"], &nodes, false);
+        let file = written(dir.path(), &format!("{round}.nc"), velocities(fixture, "face", &middles, &[]));
+        let snapshot = open(&[&file]).read(0).unwrap();
+        let (worst, known) = error(&snapshot, |_| 1.0);
+        println!("order {round}: {worst:.1e} m/s, {known:.3} known");
+        assert!(worst < 2e-2 && known > 0.94, "{round}: {worst:e} {known}");
+    }
+}
+
+/// ICON: cells by their own coordinates, the grid in a file whose dimensions have other names. MPAS: radians, units with braces, levels last. FVCOM and
+/// others: velocities at the sides of faces are not read.
+#[test]
+fn names_and_orders_of_models() {
+    let dir = tempdir().unwrap();
+    let (nodes, faces) = basin();
+    let corners = triangles(&faces);
+    let count = corners.len() / 3;
+    let middles: Vec<[f64; 2]> =
+        (0..count).map(|t| [0, 1].map(|k| (0..3).map(|c| nodes[corners[c * count + t] as usize - 1][k]).sum::<f64>() / 3.0)).collect();
+    let icon = coordinates(times(&[("ncells", count)]), "ncells", ["clon", "clat"], &middles, true);
+    let icon = written(dir.path(), "icon.nc", velocities(icon, "ncells", &middles, &[]));
+    let grid = Fixture::new(NETCDF4, &[("cell", count), ("vertex", nodes.len()), ("nv", 3)]).variable(
+        "vertex_of_cell",
+        &["nv", "cell"],
+        Data::F64(corners.clone()),
+    );
+    let grid = coordinates(
+        coordinates(grid, "vertex", ["vlon", "vlat"], &nodes, true),
+        "cell",
+        ["lon_cell_centre", "lat_cell_centre"],
+        &middles,
+        true,
+    );
+    let mut grid = grid;
+    for variable in &mut grid.variables {
+        let name = match &variable.name[..] {
+            "vlon" | "lon_cell_centre" => "longitude",
+            "vlat" | "lat_cell_centre" => "latitude",
+            _ => continue,
+        };
+        variable.attributes.push(("standard_name".into(), name.into()));
+    }
+    let grid = written(dir.path(), "icon_grid.nc", grid);
+    check_basin("ICON with its grid", &mut open(&[icon, grid]), 2e-2);
+
+    let mpas = Fixture::new(NETCDF4, &[("Time", 2), ("nCells", count), ("nVertLevels", 3)]).axis("Time", HOURS, &[0.0, 6.0]);
+    let mut mpas = coordinates(mpas, "nCells", ["lonCell", "latCell"], &middles, true);
+    for variable in mpas.variables.iter_mut().filter(|v| v.name.ends_with("Cell")) {
+        variable.attributes = vec![("units".into(), "rad".into())];
+    }
+    for (c, name) in ["uReconstructZonal", "uReconstructMeridional"].into_iter().enumerate() {
+        let values = (0..2 * count * 3).map(|i| rotation(middles[i / 3 % count])[c] * (1.0 - 0.1 * (i % 3) as f64)).collect();
+        mpas = mpas.variable(name, &["Time", "nCells", "nVertLevels"], f32s(values)).with("units", "m s^{-1}");
+    }
+    let mut archive = open_with(&[written(dir.path(), "mpas.nc", mpas)], "select = { nVertLevels = 1 }");
+    let (worst, _) = error(&archive.read(1).unwrap(), |_| 0.9);
+    assert!(worst < 2e-2, "{worst:e}");
+
+    // Times, levels, faces; a vertical velocity at the nodes of the same mesh.
+    let depths = [5.0, 50.0];
+    let fixture =
+        times(&[("nz1", 2), ("elem", count), ("nod2", nodes.len()), ("n3", 3)]).axis("nz1", "m", &depths).with("positive", "down");
+    let fixture = fixture.variable("elements", &["n3", "elem"], Data::F64(corners.clone()));
+    let mut fixture = coordinates(fixture, "nod2", ["lon", "lat"], &nodes, false);
+    for (c, name) in ["u", "v"].into_iter().enumerate() {
+        let values = (0..2 * 2 * count).map(|i| rotation(middles[i % count])[c] * (1.0 - depths[i / count % 2] / 1000.0)).collect();
+        fixture = fixture.variable(name, &["time", "nz1", "elem"], f32s(values)).with("units", "m/s");
+    }
+    let rising = (0..2 * 2 * nodes.len()).map(|i| 1e-3 * (nodes[i % nodes.len()][1])).collect();
+    let file = written(dir.path(), "w.nc", fixture.variable("w", &["time", "nz1", "nod2"], f32s(rising)).with("units", "m/s"));
+    let mut archive = open_with(&[&file], "x = \"lon\"\ny = \"lat\"");
+    let snapshot = archive.read(0).unwrap();
+    let (worst, _) = error(&snapshot, |depth| 1.0 + depth / 1000.0);
+    assert!(worst < 2e-2, "{worst:e}");
+    let [nx, ny, _] = snapshot.grid.shape();
+    for (n, node) in snapshot.nodes.iter().enumerate().filter(|(_, node)| !node[3].is_nan()) {
+        let exact = 1e-3 * snapshot.grid.axes[1].coordinates()[n / nx % ny];
+        assert!((f64::from(node[3]) - exact).abs() < 1e-5, "{} {exact}", node[3]);
+    }
+
+    let mut sides = velocities(coordinates(times(&[("edge", count)]), "edge", ["lon", "lat"], &middles, false), "edge", &middles, &[]);
+    sides.variables.iter_mut().filter(|v| v.name == "u").for_each(|v| v.attributes.push(("location".into(), "edge".into())));
+    refused(&[written(dir.path(), "edges.nc", sides)], "", &["sides of faces"]);
+    let track = velocities(coordinates(times(&[("station", count)]), "station", ["lon", "lat"], &middles, false), "station", &middles, &[]);
+    refused(&[written(dir.path(), "track.nc", track.attribute("featureType", "timeSeries"))], "", &["no dimension would be y"]);
+}
+
+#[test]
+fn a_region_of_a_globe_of_points() {
+    let dir = tempdir().unwrap();
+    let places = spiral(5000, -90.0);
+    let fixture = velocities(coordinates(times(&[("n", 5000)]), "n", ["lon", "lat"], &places, false), "n", &places, &[]);
+    let file = written(dir.path(), "globe.nc", fixture);
+    for (region, ends) in [("[-20, 30, 60, 90]", [-20.0, 30.0]), ("[170, -170, -10, 10]", [170.0, 190.0])] {
+        let mut part = open_with(&[&file], &format!("region = {region}"));
+        let axis = part.grid().axes[0].clone();
+        assert!(
+            axis.period().is_none() && (axis.first() - ends[0]).abs() < 1e-9 && (axis.last() - ends[1]).abs() < 1e-9,
+            "{region}: {axis:?}"
+        );
+        let (worst, known) = error(&part.read(0).unwrap(), |_| 1.0);
+        assert!(worst < 6e-4 && known == 1.0, "{region}: {worst:e} {known}");
+    }
+}
+
 /// As FESOM writes: one file for each component, the mesh in another, values in triangles on levels.
 #[test]
 fn components_and_mesh_in_files_of_their_own() {
@@ -241,6 +365,7 @@ fn what_is_no_mesh_in_degrees_is_refused_with_the_reason() {
     let file = |name: &str, fixture: Fixture| written(dir.path(), name, velocities(fixture, "n", &places, &[]));
     let whole = file("whole.nc", plain());
     refused(&[&whole], "grid_relative = true", &["grid_relative", "without rows"]);
+    refused(&[&whole], "metric = \"cartesian\"", &["metric", "sphere", "unstructured mesh"]);
     refused(&[&whole], "region = [0, 20, -60, -40]", &["lies beside it", "degrees north"]);
     let metres = times(&[("n", n)]).variable("x", &["n"], Data::F64(vec![1.0; n])).with("units", "m").with("standard_name", "longitude");
     let metres = metres.variable("y", &["n"], Data::F64(vec![1.0; n])).with("units", "m").with("standard_name", "latitude");

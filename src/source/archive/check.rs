@@ -64,9 +64,11 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
     let hdf5 = !format.names_dimensions();
     let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
     let curvilinear = matches!(layout.resampling, Some(Resampling::Curvilinear(_)));
+    let unstructured = matches!(&layout.resampling, Some(Resampling::Curvilinear(c)) if c.meshes[0].triangles.is_some());
     let what = match () {
+        () if unstructured => "an unstructured mesh",
         () if staggered => "WRF output",
-        () if curvilinear => "longitudes and latitudes of two dimensions and unstructured meshes",
+        () if curvilinear => "longitudes and latitudes of two dimensions",
         () => format.name(),
     };
     let terrain = staggered || layout.frames[0].iter().any(|component| component.columns.is_some());

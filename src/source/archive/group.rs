@@ -2,9 +2,11 @@
 
 use super::limits;
 use crate::archive_settings::ArchiveSettings;
+use crate::cf::coordinate::{Kind, classify};
 use crate::error::SourceError;
 use crate::formats::{DataFile, Limits};
 use crate::grids::{Content, content};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// Names of the components.
@@ -32,13 +34,16 @@ impl Part {
 /// A component without its partner at a time, or twice.
 pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<Vec<Group>>, SourceError> {
     let limits = limits(settings);
-    let (mut parts, mut helpers) = (Vec::new(), Vec::new());
+    let (mut parts, mut helpers, mut helped) = (Vec::new(), Vec::new(), HashSet::new());
     for path in paths {
         let Some(content) = DataFile::open(path, None, limits).ok().and_then(|file| content(&file, settings)) else { return Ok(None) };
         if content.components.contains(&true) {
             parts.push(Part { path: path.clone(), content });
         } else if content.helps {
-            helpers.push(path.clone());
+            // One file of each time may repeat the mesh.
+            if helped.insert(content.fixed) {
+                helpers.push(path.clone());
+            }
         } else {
             return Ok(None);
         }
@@ -124,11 +129,14 @@ fn check_coordinates(a: &DataFile, b: &DataFile) -> Result<(), SourceError> {
             continue;
         }
         // Times are compared in seconds.
-        if crate::cf::coordinate::classify(variable) == crate::cf::coordinate::Kind::Time {
+        let kind = classify(variable);
+        if kind == Kind::Time {
             continue;
         }
         let (one, other) = (a.read_all(i)?, b.read_all(j)?);
-        if let Some(k) = one.iter().zip(&other).position(|(x, y)| x != y && !(x.is_nan() && y.is_nan())) {
+        // A mesh may count heights, and the fields on it depths.
+        let same = |x: f64, y: f64| x == y || (x.is_nan() && y.is_nan()) || (kind == Kind::Level && x == -y);
+        if let Some(k) = one.iter().zip(&other).position(|(x, y)| !same(*x, *y)) {
             let what = format!(
                 "entry {k} of `{}` is {} and {}; components in files of their own lie on one grid",
                 variable.name, one[k], other[k]

@@ -46,7 +46,8 @@ fn base(name: &str) -> Option<Unit> {
 impl Unit {
     /// Parses a unit; `None` if a part of it is unknown.
     pub fn parse(text: &str) -> Option<Self> {
-        let text = text.trim().replace("**", "").replace('^', "").replace(['·', '*', '(', ')'], " ").replace(" per ", "/");
+        let text =
+            text.trim().replace("**", "").replace('^', "").replace(['{', '}'], "").replace(['·', '*', '(', ')'], " ").replace(" per ", "/");
         let mut unit = NONE;
         for (i, part) in text.split('/').enumerate() {
             for token in part.split_whitespace().flat_map(split_dots) {

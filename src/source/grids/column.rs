@@ -7,28 +7,54 @@
 //! - `ocean_s_coordinate_g1` (ROMS, `Vtransform` 1): z = S + eta (1 + S / h), S = h_c s + (h - h_c) C
 //! - `ocean_s_coordinate_g2` (ROMS, `Vtransform` 2): z = eta + (eta + h) S, S = (h_c s + h C) / (h_c + h)
 //! - `ocean_sigma_coordinate`: z = eta + (eta + h) sigma, which is the last one with h_c = 0 and C = sigma
+//!
+//! Those of the atmosphere (`atmosphere_hybrid_sigma_pressure_coordinate`, `atmosphere_sigma_coordinate`) have the pressure p = a + b p_s, with the
+//! pressure p_s at the ground, whose height is that of the isothermal atmosphere (see [`super::levels`]).
 
 use super::component::{ComponentPlan, Orders, read_component};
+use super::levels::{REFERENCE_PRESSURE, height_of, pressure_at, upward};
 use crate::error::SourceError;
 use crate::formats::DataFile;
 
-/// How heights follow from s.
+/// How heights follow from the two numbers of a level: s and C(s), or a (Pa) and b.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Formula {
     S,
     G1,
     G2,
+    Hybrid,
 }
 
 impl Formula {
-    /// Height above the sea at rest, metres.
-    fn height(self, [s, stretching]: [f64; 2], critical: f64, depth: f64, surface: f64) -> f64 {
-        let linear = critical * s + (depth - critical) * stretching;
+    /// Height above the sea at rest, metres. The ground is its depth below the sea, metres, or its pressure, Pa.
+    fn height(self, [s, stretching]: [f64; 2], critical: f64, ground: f64, surface: f64) -> f64 {
+        let linear = critical * s + (ground - critical) * stretching;
         match self {
             Self::S => surface * (1.0 + s) + linear,
-            Self::G1 => linear + surface * (1.0 + linear / depth),
-            Self::G2 => surface + (surface + depth) * (critical * s + depth * stretching) / (critical + depth),
+            Self::G1 => linear + surface * (1.0 + linear / ground),
+            Self::G2 => surface + (surface + ground) * (critical * s + ground * stretching) / (critical + ground),
+            Self::Hybrid => height_of(s + stretching * ground),
         }
+    }
+
+    /// Lower and upper end of a column. The atmosphere has none above.
+    fn ends(self, ground: f64, surface: f64) -> [f64; 2] {
+        match self {
+            Self::S | Self::G1 | Self::G2 => [-ground, surface.max(0.0)],
+            Self::Hybrid => [height_of(ground), f64::INFINITY],
+        }
+    }
+
+    /// Numbers that ascend with the height of the levels.
+    pub fn rank(self, [s, stretching]: [f64; 2]) -> f64 {
+        match self {
+            Self::S | Self::G1 | Self::G2 => s,
+            Self::Hybrid => -(s + stretching * REFERENCE_PRESSURE),
+        }
+    }
+
+    pub fn is_of_air(self) -> bool {
+        self == Self::Hybrid
     }
 }
 
@@ -36,15 +62,18 @@ impl Formula {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Columns {
     pub formula: Formula,
-    /// s and C(s), from the bottom upwards.
+    /// The numbers of each level, from the bottom upwards.
     pub levels: Vec<[f64; 2]>,
     /// Index in the file of each level.
     pub order: Vec<usize>,
     /// h_c, metres.
     pub critical_depth: f64,
-    pub depth: ComponentPlan,
+    /// Depth of the sea, metres, or pressure at the ground, Pa.
+    pub ground: ComponentPlan,
     /// Height of the surface; without it 0.
     pub surface: Option<ComponentPlan>,
+    /// True if the component is the change of a particle's pressure, Pa/s, which is read as a vertical velocity.
+    pub is_tendency: bool,
     /// Heights of the grid, ascending, metres.
     pub heights: Vec<f64>,
 }
@@ -59,47 +88,58 @@ impl Columns {
     pub fn read(&self, file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
         let [x, y, wanted] = orders;
         let values = read_component(file, component, &[x.clone(), y.clone(), self.order.clone()], entry)?;
-        let depth = at_points(file, &self.depth, component, orders, entry)?;
+        let ground = at_points(file, &self.ground, component, orders, entry)?;
         let surface = self.surface.as_ref().map(|plan| at_points(file, plan, component, orders, entry)).transpose()?;
         let plane = x.len() * y.len();
         let mut out = vec![f32::NAN; plane * wanted.len()];
         let mut own = vec![0f32; self.levels.len()];
         for point in 0..plane {
-            let (depth, surface) = (depth[point], surface.as_ref().map_or(0.0, |surface| surface[point]));
+            let (ground, surface) = (ground[point], surface.as_ref().map_or(0.0, |surface| surface[point]));
             for (height, &level) in own.iter_mut().zip(&self.levels) {
-                *height = self.formula.height(level, self.critical_depth, depth, surface) as f32;
+                *height = self.formula.height(level, self.critical_depth, ground, surface) as f32;
             }
-            let ends = [-depth as f32, surface.max(0.0) as f32];
+            let ends = self.formula.ends(ground, surface).map(|end| end as f32);
+            let value = |k: usize| {
+                let value = values[k * plane + point];
+                if self.is_tendency { upward(value.into(), pressure_at(own[k].into())) as f32 } else { value }
+            };
             // A missing surface makes missing heights.
             if own.iter().any(|height| !height.is_finite()) {
                 continue;
             }
             for (level, &k) in wanted.iter().enumerate() {
-                let found = in_layer(self.heights[k] as f32, ends, own.len(), |k| own[k], |k| values[k * plane + point]);
+                let found = in_layer(self.heights[k] as f32, ends, own.len(), |k| own[k], value);
                 out[level * plane + point] = found.unwrap_or(f32::NAN);
             }
         }
         Ok(out)
     }
 
-    /// Mean heights of the levels over all columns, with the surface at rest, and 0.
+    /// Mean heights of the levels over all columns at the first time; in the sea with the surface at rest, and 0.
     pub fn mean_heights(&self, file: &DataFile) -> Result<Vec<f64>, SourceError> {
-        let mut depths = read_component(file, &self.depth, &self.depth.file_order(), 0)?;
-        depths.retain(|depth| depth.is_finite() && *depth > 0.0);
+        let mut grounds = read_component(file, &self.ground, &self.ground.file_order(), 0)?;
+        grounds.retain(|ground| ground.is_finite() && *ground > 0.0);
         let mean = |level: &[f64; 2]| {
-            let heights = depths.iter().map(|&depth| self.formula.height(*level, self.critical_depth, depth.into(), 0.0));
-            heights.sum::<f64>() / depths.len() as f64
+            let heights = grounds.iter().map(|&ground| self.formula.height(*level, self.critical_depth, ground.into(), 0.0));
+            heights.sum::<f64>() / grounds.len() as f64
         };
-        let mut heights: Vec<f64> = self.levels.iter().map(mean).filter(|z| *z < 0.0).collect();
-        heights.push(0.0);
+        let mut heights: Vec<f64> = self.levels.iter().map(mean).filter(|z| z.is_finite()).collect();
+        if !self.formula.is_of_air() {
+            heights.retain(|z| *z < 0.0);
+            heights.push(0.0);
+        }
         heights.dedup();
         Ok(heights)
     }
 
-    /// Greatest depth of the bottom, metres.
-    pub fn deepest(&self, file: &DataFile) -> Result<f64, SourceError> {
-        let depths = read_component(file, &self.depth, &self.depth.file_order(), 0)?;
-        Ok(depths.into_iter().filter(|depth| depth.is_finite()).fold(f64::NEG_INFINITY, |a, b| a.max(b.into())))
+    /// Heights of the lowest ground and of the surface at rest or, in the atmosphere, of the highest level, metres.
+    pub fn reach(&self, file: &DataFile) -> Result<[f64; 2], SourceError> {
+        let grounds = read_component(file, &self.ground, &self.ground.file_order(), 0)?;
+        // Deep, or of high pressure.
+        let lowest = grounds.into_iter().filter(|ground| ground.is_finite()).fold(f64::NEG_INFINITY, |a, b| a.max(b.into()));
+        let [bottom, surface] = self.formula.ends(lowest, 0.0);
+        let highest = self.levels.last().map_or(0.0, |&level| self.formula.height(level, self.critical_depth, lowest, 0.0));
+        Ok([bottom, if self.formula.is_of_air() { highest } else { surface }])
     }
 }
 
@@ -164,6 +204,15 @@ mod tests {
         let wide = |z: f32| in_layer(z, [-1.0, 42.0], 3, |k| heights[k], |k| heights[k] * 2.0);
         assert_eq!((wide(-1.0), wide(25.0), wide(42.0)), (Some(0.0), Some(50.0), Some(80.0)));
         assert_eq!((wide(-1.1), wide(42.1)), (None, None));
+    }
+
+    #[test]
+    fn hybrid_levels_lie_between_the_ground_and_the_top() {
+        let at = |level: [f64; 2], ground: f64| Formula::Hybrid.height(level, 0.0, ground, 0.0);
+        assert_eq!(at([0.0, 1.0], 90_000.0), Formula::Hybrid.ends(90_000.0, 0.0)[0]);
+        assert!((at([50_000.0, 0.0], 1.0) - 7000.0 * 2f64.ln()).abs() < 1e-9);
+        assert!((pressure_at(at([20_000.0, 0.5], 80_000.0)) - 60_000.0).abs() < 1e-6);
+        assert!(Formula::Hybrid.rank([10_000.0, 0.1]) > Formula::Hybrid.rank([0.0, 1.0]));
     }
 
     #[test]

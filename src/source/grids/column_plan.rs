@@ -1,10 +1,11 @@
-//! Finds levels that follow the bottom of the sea: by `formula_terms` (CF conventions, appendix D), else by the names of ROMS and CROCO.
+//! Finds levels that follow the bottom of the sea or the ground: by `formula_terms` (CF conventions, appendix D), else by the names of ROMS and CROCO.
 
 use super::axes::{AxisPlan, Quantity};
 use super::column::{Columns, Formula};
 use super::component::{ComponentPlan, Role};
 use super::dimensions::Extent;
 use super::layout::Layout;
+use super::levels::REFERENCE_PRESSURE;
 use super::planner::Planner;
 use crate::cf::coordinate::Kind;
 use crate::cf::units::Unit;
@@ -17,8 +18,9 @@ use std::sync::Arc;
 /// Levels of u, v and w that follow the bottom, and their dimensions.
 pub struct Terrain {
     of: Vec<Option<(usize, Arc<Columns>)>>,
-    /// Heights of the grid, metres; one if a single depth is read.
+    /// Heights of the grid, metres; one if a single one is read.
     heights: Vec<f64>,
+    formula: Formula,
 }
 
 /// Names of ROMS and CROCO, for levels of tracers and those between them: s, C(s).
@@ -30,7 +32,12 @@ impl Terrain {
         self.of.get(which).and_then(Option::as_ref).is_some_and(|(own, _)| *own == dimension)
     }
 
-    /// False if a single depth is read.
+    /// True if w may be the change of a particle's pressure.
+    pub fn is_of_air(&self) -> bool {
+        self.formula.is_of_air()
+    }
+
+    /// False if a single height is read.
     pub fn is_three(&self) -> bool {
         self.heights.len() > 1
     }
@@ -60,7 +67,11 @@ impl Planner<'_> {
         }
         found.push(v);
         found.push(match &velocity.w {
-            Some(w) => self.columns(w.variable, time)?,
+            Some(w) => {
+                let is_tendency = Unit::parse(self.settings.unit("w").or(self.variable(w.variable).units()).unwrap_or_default())
+                    .is_some_and(|unit| unit.is_pressure_tendency());
+                self.columns(w.variable, time)?.map(|(dimension, columns)| (dimension, Columns { is_tendency, ..columns }))
+            }
             None => None,
         });
         let Some((_, columns)) = &found[0] else { return Ok(None) };
@@ -70,21 +81,31 @@ impl Planner<'_> {
             [one] => format!("to height {one} m"),
             _ => format!("to {} heights from {:.1} to {:.1} m", heights.len(), heights[0], heights[heights.len() - 1]),
         };
-        let why = match (self.settings.level, &self.settings.heights) {
-            (None, None) => {
+        let formula = columns.formula;
+        let default = match formula.is_of_air() {
+            true => "the mean heights of the levels over all columns; others with archive.heights, one with --set archive.level=HEIGHT",
+            false => {
                 "0 and the mean heights of the levels over all columns; others with archive.heights, one with --set archive.level=-DEPTH"
             }
-            _ => "as set",
         };
+        let why = if (self.settings.level, &self.settings.heights) == (None, &None) { default } else { "as set" };
         let surface =
             columns.surface.as_ref().map_or("at rest, since no term gives its height".into(), |s| format!("`{}` of each time", s.name));
+        let ground = &columns.ground.name;
+        let (follows, terms, under) = match formula.is_of_air() {
+            true => (
+                "the ground",
+                format!("pressure at the ground `{ground}`, heights z = -H ln(p / p0) with H = 7 km and p0 = 1000 hPa"),
+                "the ground",
+            ),
+            false => ("the bottom", format!("depth `{ground}`, surface {surface}"), "the bottom"),
+        };
         self.note(format!(
-            "`{level}` follows the bottom (CF conventions, appendix D; depth `{}`, surface {surface}): each column is interpolated between its own \
-             levels {to} ({why}); below the bottom it is missing",
-            columns.depth.name
+            "`{level}` follows {follows} (CF conventions, appendix D; {terms}): each column is interpolated between its own levels {to} ({why}); below \
+             {under} it is missing"
         ));
         let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
-        Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights }))
+        Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, formula }))
     }
 
     fn heights_for(&self, columns: &Columns, first: Option<&Layout>) -> Result<Vec<f64>, SourceError> {
@@ -96,22 +117,24 @@ impl Planner<'_> {
             }
             (_, _, Some(known)) => Ok(known),
             (Some(level), None, None) => {
-                let deepest = columns.deepest(self.file)?;
-                if !(-deepest..=0.0).contains(&level) {
-                    let accepted =
-                        format!("heights in metres, negative below the surface: from {:.1} at the deepest bottom to 0", -deepest);
+                let [low, high] = columns.reach(self.file)?;
+                if !(low..=high).contains(&level) {
+                    let accepted = match columns.formula.is_of_air() {
+                        true => format!("heights in metres: from {low:.1} at the lowest ground to {high:.1}"),
+                        false => format!("heights in metres, negative below the surface: from {low:.1} at the deepest bottom to 0"),
+                    };
                     return Err(SourceError::setting("level", level.to_string(), accepted));
                 }
                 Ok(vec![level])
             }
             (None, Some(heights), None) if heights.len() < 2 => {
-                let accepted = "two heights or more, in metres, negative below the surface; one with --set archive.level=-DEPTH";
+                let accepted = "two heights or more, in metres, negative below the surface of the sea; one with --set archive.level=HEIGHT";
                 Err(SourceError::setting("heights", format!("{heights:?}"), accepted))
             }
             (None, Some(heights), None) => Ok(heights.clone()),
             (None, None, None) => match columns.mean_heights(self.file)? {
                 heights if heights.len() < 2 => {
-                    Err(SourceError::variable(self.path(), &columns.depth.name, "no depth is above 0: the levels have no heights"))
+                    Err(SourceError::variable(self.path(), &columns.ground.name, "it is nowhere above 0: the levels have no heights"))
                 }
                 heights => Ok(heights),
             },
@@ -133,7 +156,9 @@ impl Planner<'_> {
         let Some(terrain) = terrain else { return Some(w) };
         let name = &self.variable(w.variable).name;
         let odd = match () {
-            () if self.settings.w.is_none() && name.eq_ignore_ascii_case("omega") => "is the velocity through the levels",
+            () if self.settings.w.is_none() && !terrain.is_of_air() && name.eq_ignore_ascii_case("omega") => {
+                "is the velocity through the levels"
+            }
             () if terrain.columns(2).is_none() => "does not lie on levels that follow the bottom",
             () => return Some(w),
         };
@@ -165,17 +190,18 @@ impl Planner<'_> {
                 Some(level) => self.by_terms(variable, dimension, level)?,
                 None => self.by_names(dimension)?,
             };
-            let Some(Terms { formula, levels, critical_depth, depth, surface }) = found else { continue };
+            let Some(Terms { formula, levels, critical_depth, ground, surface }) = found else { continue };
             let mut order: Vec<usize> = (0..levels.len()).collect();
-            order.sort_by(|&a, &b| levels[a][0].total_cmp(&levels[b][0]));
+            order.sort_by(|&a, &b| formula.rank(levels[a]).total_cmp(&formula.rank(levels[b])));
             if levels.iter().flatten().any(|v| !v.is_finite()) || !critical_depth.is_finite() {
                 return Err(self.misfit(variable, "a term of its levels is missing or not a number"));
             }
             let plane = [x, y].map(|d| self.listing().dimensions[d].len);
-            let depth = self.plane_field(depth, plane, time, variable)?;
+            let ground = self.plane_field(ground, plane, time, variable)?;
             let surface = surface.map(|index| self.plane_field(index, plane, time, variable)).transpose()?;
             let levels = order.iter().map(|&k| levels[k]).collect();
-            return Ok(Some((dimension, Columns { formula, levels, order, critical_depth, depth, surface, heights: Vec::new() })));
+            let columns = Columns { formula, levels, order, critical_depth, ground, surface, is_tendency: false, heights: Vec::new() };
+            return Ok(Some((dimension, columns)));
         }
         Ok(None)
     }
@@ -192,6 +218,21 @@ impl Planner<'_> {
         };
         let listing = self.listing();
         let find = |term: &str, usual: &str| listing.find(name_of(term).unwrap_or(usual));
+        if declared.is_of_air() {
+            let Some(ground) = find("ps", "ps") else {
+                let (name, ground) = (&coordinate.name, name_of("ps").unwrap_or("ps"));
+                self.note(format!(
+                    "`{name}` follows the ground, but the pressure there, `{ground}`, is not in the files: name the file that holds it too, to read fixed heights"
+                ));
+                return Ok(None);
+            };
+            let levels = self.pressures(declared, level, dimension, &name_of)?;
+            let Some(levels) = levels else {
+                let what = format!("its levels `{}` lack a term of their formula (`formula_terms`)", coordinate.name);
+                return Err(self.misfit(variable, what));
+            };
+            return Ok(Some(Terms { formula: Formula::Hybrid, levels, critical_depth: 0.0, ground, surface: None }));
+        }
         let Some(depth) = find("depth", "h") else {
             let (name, depth) = (&coordinate.name, name_of("depth").unwrap_or("h"));
             self.note(format!(
@@ -203,7 +244,7 @@ impl Planner<'_> {
         let s = self.coordinate_values(level)?;
         if declared == Declared::Sigma {
             let levels = s.iter().map(|&s| [s, s]).collect();
-            return Ok(Some(Terms { formula: Formula::G2, levels, critical_depth: 0.0, depth, surface }));
+            return Ok(Some(Terms { formula: Formula::G2, levels, critical_depth: 0.0, ground: depth, surface }));
         }
         // ROMS of before the names g1 and g2 says more by its variables.
         if declared == Declared::S
@@ -229,9 +270,42 @@ impl Planner<'_> {
                 let names: Vec<&str> = name_of("C").into_iter().chain(usual).collect();
                 (formula, self.along_levels(&names, dimension)?.ok_or_else(|| lacking("C"))?)
             }
+            Declared::Hybrid | Declared::AirSigma => return Ok(None),
         };
         let levels = s.into_iter().zip(stretching).map(|(s, c)| [s, c]).collect();
-        Ok(Some(Terms { formula, levels, critical_depth, depth, surface }))
+        Ok(Some(Terms { formula, levels, critical_depth, ground: depth, surface }))
+    }
+
+    /// a (Pa) and b of the levels of the atmosphere, whose pressure is a + b p_s. `None` if a term is not there.
+    fn pressures<'t>(
+        &mut self,
+        declared: Declared,
+        level: usize,
+        dimension: usize,
+        name_of: &dyn Fn(&str) -> Option<&'t str>,
+    ) -> Result<Option<Vec<[f64; 2]>>, SourceError> {
+        let pascals = |index: Option<usize>| {
+            let unit = index.and_then(|index| Unit::parse(self.variable(index).units()?));
+            unit.filter(Unit::is_pressure).map_or(1.0, |unit| unit.factor)
+        };
+        let named = |term: &str| name_of(term).and_then(|name| self.listing().find(name));
+        let row = |term: &str| name_of(term).map_or(Ok(None), |name| self.along_levels(&[name], dimension));
+        let number = |term: &str| name_of(term).map_or(Ok(None), |name| self.scalar(&[name]));
+        if declared == Declared::AirSigma {
+            let Some(top) = number("ptop")? else { return Ok(None) };
+            let top = top * pascals(named("ptop"));
+            return Ok(Some(self.coordinate_values(level)?.into_iter().map(|sigma| [top * (1.0 - sigma), sigma]).collect()));
+        }
+        let (fixed, share) = (row("ap")?, row("b")?);
+        let fixed = match fixed {
+            Some(fixed) => Some(fixed.into_iter().map(|a| a * pascals(named("ap"))).collect::<Vec<_>>()),
+            // Without p0, the one of most models.
+            None => {
+                let reference = number("p0")?.map_or(REFERENCE_PRESSURE, |p| p * pascals(named("p0")));
+                row("a")?.map(|a| a.into_iter().map(|a| a * reference).collect())
+            }
+        };
+        Ok(fixed.zip(share).map(|(fixed, share)| fixed.into_iter().zip(share).map(|(a, b)| [a, b]).collect()))
     }
 
     /// Terms by the names of ROMS and CROCO.
@@ -254,7 +328,7 @@ impl Planner<'_> {
             Some(odd) => return Err(self.fault(format!("`Vtransform` is {odd}; accepted are 1 and 2"))),
         };
         let levels = s.into_iter().zip(stretching).map(|(s, c)| [s, c]).collect();
-        Ok(Some(Terms { formula, levels, critical_depth, depth, surface: self.listing().find("zeta") }))
+        Ok(Some(Terms { formula, levels, critical_depth, ground: depth, surface: self.listing().find("zeta") }))
     }
 
     /// The first of some numbers: a variable of one entry, or an attribute of the file.
@@ -280,7 +354,7 @@ impl Planner<'_> {
         Ok(names.iter().find_map(attribute))
     }
 
-    /// A length over the plane of a variable, on its points or with one more along x or y; its last two dimensions are y and x.
+    /// A length or a pressure over the plane of a variable, on its points or with one more along x or y; its last two dimensions are y and x.
     fn plane_field(&self, field: usize, plane: [usize; 2], time: Option<usize>, of: usize) -> Result<ComponentPlan, SourceError> {
         let variable = self.variable(field);
         let shape = self.shape(field);
@@ -307,7 +381,7 @@ impl Planner<'_> {
             _ if Some(variable.dimensions[k]) == time => Role::Time,
             _ => Role::Fixed(0),
         };
-        let unit = variable.units().and_then(Unit::parse).filter(Unit::is_length);
+        let unit = variable.units().and_then(Unit::parse).filter(|unit| unit.is_length() || unit.is_pressure());
         Ok(ComponentPlan {
             name: variable.name.clone(),
             roles: (0..rank).map(role).collect(),
@@ -326,10 +400,10 @@ impl Planner<'_> {
 /// What a formula needs.
 struct Terms {
     formula: Formula,
-    /// s and C(s), in the order of the file.
+    /// See [`Columns::levels`], in the order of the file.
     levels: Vec<[f64; 2]>,
     critical_depth: f64,
-    depth: usize,
+    ground: usize,
     surface: Option<usize>,
 }
 
@@ -340,6 +414,14 @@ enum Declared {
     S,
     G1,
     G2,
+    Hybrid,
+    AirSigma,
+}
+
+impl Declared {
+    fn is_of_air(self) -> bool {
+        matches!(self, Self::Hybrid | Self::AirSigma)
+    }
 }
 
 fn formula_of(coordinate: &Variable) -> Option<Declared> {
@@ -348,6 +430,8 @@ fn formula_of(coordinate: &Variable) -> Option<Declared> {
         "ocean_s_coordinate" => Some(Declared::S),
         "ocean_s_coordinate_g1" => Some(Declared::G1),
         "ocean_s_coordinate_g2" => Some(Declared::G2),
+        "atmosphere_hybrid_sigma_pressure_coordinate" => Some(Declared::Hybrid),
+        "atmosphere_sigma_coordinate" => Some(Declared::AirSigma),
         _ => None,
     }
 }

@@ -4,9 +4,9 @@ use super::mask::holds_mask;
 use super::planner::Planner;
 use super::unstructured_plan::holds_mesh;
 use crate::archive_settings::ArchiveSettings;
-use crate::cf::coordinate::{Kind, classify};
+use crate::cf::coordinate::{Kind, classify, classify_name};
 use crate::cf::velocity::{Component, judge};
-use crate::formats::DataFile;
+use crate::formats::{DataFile, Listing, Variable};
 
 /// Components and times of a file.
 pub struct Content {
@@ -16,8 +16,15 @@ pub struct Content {
     pub seconds: Vec<f64>,
     /// The times, in words.
     pub when: String,
+    /// Names and shapes of the variables that do not change with time.
+    pub fixed: Vec<(String, Vec<usize>)>,
     /// True if it holds a mask, longitudes and latitudes of two dimensions, or an unstructured mesh.
     pub helps: bool,
+}
+
+fn fixed(listing: &Listing) -> Vec<(String, Vec<usize>)> {
+    let moves = |v: &Variable| v.dimensions.iter().any(|&d| classify_name(&listing.dimensions[d].name) == Kind::Time);
+    listing.variables.iter().filter(|v| !moves(v)).map(|v| (v.name.clone(), listing.shape(v))).collect()
 }
 
 /// Contents of a file; `None` if its times are not understood.
@@ -41,6 +48,7 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Option<Content> {
         components: variables.map(|v| v.is_some()),
         seconds: Vec::new(),
         when: String::new(),
+        fixed: fixed(listing),
         helps: holds_mask(listing, settings) || pair.iter().all(Option::is_some) || holds_mesh(listing),
     };
     if let Some(variable) = variables.into_iter().flatten().next() {

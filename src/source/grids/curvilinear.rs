@@ -3,8 +3,9 @@
 //!
 //! Algorithm: each node of the new grid is located in a cell of the mesh, in the plane that touches the sphere at the cell (gnomonic
 //! projection). Its value is the inverse bilinear interpolation of the cell's four corners. It is missing if a corner is missing or no
-//! cell contains the node; of points without rows, see [`super::triangles`]. Each horizontal component is resampled from its own points as a vector in space, along its direction
-//! there: east and north turn about a pole within a cell, vectors do not.
+//! cell contains the node. Points without rows are the corners of triangles: see [`super::triangles`]. Each horizontal component is
+//! resampled from its own points as a vector in space, along its direction there: east and north turn about a pole within a cell, vectors
+//! do not.
 
 use super::axes::{AxisPlan, Quantity};
 use super::component::{ComponentPlan, read_levels};

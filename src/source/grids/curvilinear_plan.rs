@@ -227,7 +227,9 @@ impl Planner<'_> {
             (start[rank - 2], count[rank - 2]) = (row, 1);
         }
         let packing = self.packing(index)?;
-        let radians = variable.units().is_some_and(|u| u.to_ascii_lowercase().starts_with("radian"));
+        // MPAS writes radians, and may not say so.
+        let is_mpas = ["loncell", "latcell"].contains(&variable.name.to_ascii_lowercase().as_str());
+        let radians = variable.units().map_or(is_mpas, |u| u.to_ascii_lowercase().starts_with("rad"));
         let degrees = |v: f64| if radians { v.to_degrees() } else { v };
         Ok(self.file.read(index, start, count)?.into_iter().map(|v| degrees(packing.unpack(v))).collect())
     }
@@ -235,11 +237,14 @@ impl Planner<'_> {
     /// Refuses a later file whose points differ from those of the first. Compares the first and the last row, which cost little to
     /// read.
     fn check_points(&self, points: &[Points], first: &Curvilinear) -> Result<(), SourceError> {
-        for (points, mesh) in points.iter().zip(&first.meshes) {
-            if points.cells != Cells::Rows {
-                self.check_unstructured(points, mesh)?;
+        for (k, (own, mesh)) in points.iter().zip(&first.meshes).enumerate() {
+            if own.cells != Cells::Rows {
+                if !points[..k].contains(own) {
+                    self.check_unstructured(own, mesh)?;
+                }
                 continue;
             }
+            let points = own;
             let whole = if points.between == [false; 2] { None } else { Some(self.mesh(points)?) };
             let whole = [whole.as_ref().map(|mesh| &mesh.longitude), whole.as_ref().map(|mesh| &mesh.latitude)];
             for ((&index, known), whole) in points.pair.iter().zip([&mesh.longitude, &mesh.latitude]).zip(whole) {
@@ -330,7 +335,7 @@ impl Planner<'_> {
             return Err(self.misfit(velocity.v.variable, format!("u has {} levels, v {}", levels[0], levels[1])));
         }
         let w = self.vertical_candidate(velocity, terrain.as_ref());
-        let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
+        let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three, terrain.as_ref())?;
         match w {
             Some(w) if terrain.is_some() || w.along(2) == levels[0] => components.push(w),
             Some(w) => self.note(format!("`{}` lies on other levels than u: vertical motion is taken as 0", w.name)),

@@ -198,7 +198,8 @@ impl Planner<'_> {
         self.listing().check_count(self.variable(variable), &shape[shape.len().saturating_sub(2)..])?;
         for (place, len) in shape.into_iter().enumerate() {
             self.listing().check_count(self.variable(variable), &[len])?;
-            if place > 0 && len > MAX_NODES {
+            // Points of an unstructured mesh are no axis.
+            if place > 0 && len > MAX_NODES && !self.is_along_mesh(self.variable(variable).dimensions[place]) {
                 return Err(self.misfit(variable, format!("{len} nodes along a dimension are too many; accepted are up to {MAX_NODES}")));
             }
         }

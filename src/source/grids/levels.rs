@@ -9,6 +9,21 @@ pub const SCALE_HEIGHT: f64 = 7000.0;
 /// Pressure at height 0, Pa.
 pub const REFERENCE_PRESSURE: f64 = 100_000.0;
 
+/// Height of a pressure (Pa), metres.
+pub fn height_of(pressure: f64) -> f64 {
+    SCALE_HEIGHT * (REFERENCE_PRESSURE / pressure).ln()
+}
+
+/// Pressure at a height (metres), Pa.
+pub fn pressure_at(height: f64) -> f64 {
+    REFERENCE_PRESSURE * (-height / SCALE_HEIGHT).exp()
+}
+
+/// Vertical velocity of a particle whose pressure changes at this rate (Pa/s): w = -H omega / p.
+pub fn upward(omega: f64, pressure: f64) -> f64 {
+    -SCALE_HEIGHT * omega / pressure
+}
+
 /// Turns a level axis into (scaled) heights in metres. Returns also the factor of each level from velocities along the file's axis to
 /// velocities along the new one; for pressures w = -H omega / p.
 ///
@@ -21,8 +36,8 @@ pub fn to_heights(mut plan: AxisPlan, scale: f64) -> Result<(AxisPlan, Vec<f64>)
     if plan.quantity == Quantity::Pressure {
         plan.order.reverse();
         coordinates.reverse();
-        factors = coordinates.iter().map(|p| -SCALE_HEIGHT / p * scale).collect();
-        coordinates.iter_mut().for_each(|p| *p = SCALE_HEIGHT * (REFERENCE_PRESSURE / *p).ln());
+        factors = coordinates.iter().map(|&p| upward(scale, p)).collect();
+        coordinates.iter_mut().for_each(|p| *p = height_of(*p));
         plan.quantity = Quantity::Length;
         plan.notes.push(format!(
             "`{name}`: pressure p read as height z = -H ln(p / p0), omega as w = -H omega / p, with H = 7 km and p0 = 1000 hPa{}",

@@ -40,6 +40,8 @@ const GOLDEN: f64 = 0.618_033_988_749_895;
 const MIN_EXTENT: f64 = 1e-6;
 /// Degrees of longitude above which the curvature of a cell's sides counts.
 const WIDE: f64 = 5.0;
+/// Width of the area of a point, as a share of the distance to its neighbours, below which points lie along a line.
+const NARROW: f64 = 0.1;
 /// Largest number of columns that a mesh repeats at its seam.
 const MAX_REPEATED: usize = 4;
 /// Largest distance outside a cell, in units of the cell, at which a node still counts as inside: rounding must not open seams.
@@ -238,8 +240,8 @@ impl Mesh {
 
 fn median(mut values: Vec<f64>) -> Option<f64> {
     values.retain(|v| *v > 0.0);
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// An even grid that covers a mesh, or the part of it in `region` (west, east, south, north), in steps of `resolution` degrees or of the mesh's own
@@ -254,8 +256,11 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>, region: Option<[f64; 4]
     if let Some(odd) = resolution.and_then(|r| r.into_iter().find(|r| !(*r > 0.0 && *r <= 45.0))) {
         return Err(format!("a `resolution` of {odd} degrees: accepted are numbers above 0, up to 45"));
     }
+    // Faces reach beyond their middles.
+    let [longitude, latitude] =
+        mesh.triangles.as_ref().and_then(Triangles::nodes).map_or([&mesh.longitude, &mesh.latitude], |[lon, lat]| [lon, lat]);
     let known: Vec<[f64; 2]> =
-        (0..mesh.longitude.len()).map(|n| [mesh.longitude[n], mesh.latitude[n]]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
+        longitude.iter().zip(latitude).map(|(&lon, &lat)| [lon, lat]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
     let Some(along_x) = median(mesh.spacings()) else { return Err("no two neighbouring points differ: they make no cell".into()) };
     let latitudes: Vec<f64> = known.iter().map(|p| p[1]).collect();
     let (mut south, mut north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
@@ -265,7 +270,11 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>, region: Option<[f64; 4]
         return Err(format!("its points lie on one parallel, at {south} degrees north: they make no cell"));
     }
     let cosine = middle[middle.len() / 2].to_radians().cos().max(0.1);
-    let own = mesh.steps().map(|[east, north]| [east / cosine, north]);
+    let steps = mesh.steps();
+    if mesh.triangles.is_some() && steps.is_none_or(|[east, _]| east < NARROW * along_x) {
+        return Err("its points lie along a line: they make no cell".into());
+    }
+    let own = steps.map(|[east, north]| [east / cosine, north]);
     let Some(mut step) = resolution.or(own) else { return Err("no four neighbouring points make a cell".into()) };
 
     // The widest arc without a point lies outside the mesh, unless it is as narrow as a cell.
@@ -293,15 +302,14 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>, region: Option<[f64; 4]
         let ends = format!("{start} to {} degrees east and from {south} to {north} degrees north", start + width);
         (south, north) = (south.max(low), north.min(high));
         let wanted = (east - west).rem_euclid(360.0);
-        let wanted = if wanted == 0.0 { 360.0 } else { wanted };
         let from = (west - start).rem_euclid(360.0);
-        if round {
-            round = wanted == 360.0;
-            (start, width) = (if round { start } else { west }, wanted);
-        } else {
-            // The part that begins within the mesh, or the one that reaches it from the west.
-            let (begin, end) = if from < width { (from, (from + wanted).min(width)) } else { (0.0, (from + wanted - 360.0).min(width)) };
-            (start, width) = (start + begin, end - begin);
+        match () {
+            // All around.
+            () if wanted == 0.0 => {}
+            () if round => (round, start, width) = (false, west, wanted),
+            // It begins in the mesh, and may come back to it behind the part of the circle without points.
+            () if from < width => (start, width) = (start + from, if from + wanted > 360.0 { wanted } else { wanted.min(width - from) }),
+            () => width = (from + wanted - 360.0).min(width),
         }
         if width <= MIN_EXTENT || north - south <= MIN_EXTENT {
             return Err(format!("the region [{west}, {east}, {low}, {high}] lies beside it: it reaches from {ends}"));
@@ -627,6 +635,28 @@ mod tests {
             let found = mesh(place).steps().unwrap();
             assert!((found[0] / east - 1.0).abs() < 1e-5 && (found[1] / north - 1.0).abs() < 1e-5, "{found:?}");
         }
+    }
+
+    #[test]
+    fn a_region_is_the_part_of_the_grid_in_it() {
+        // Meshes of 10 rows from one longitude to another, and the ends of the grid in a region.
+        let ends = |first: f64, last: f64, region: [f64; 2]| {
+            let columns = ((last - first) / 2.0).round() as usize + 1;
+            let longitude = (0..columns * 10).map(|n| first + 2.0 * (n % columns) as f64).collect();
+            let mesh = Mesh::rows([columns, 10], longitude, (0..columns * 10).map(|n| 2.0 * (n / columns) as f64).collect());
+            let target = target(&mesh, None, Some([region[0], region[1], 3.0, 90.0]))?;
+            assert_eq!((target.first[1], target.first[1] + target.step[1] * (target.nodes[1] - 1) as f64), (3.0, 18.0));
+            let last = target.first[0] + target.step[0] * (target.nodes[0] - 1) as f64;
+            Ok::<_, String>(([target.first[0], last].map(|l| (l * 1e6).round() / 1e6), target.round))
+        };
+        assert_eq!(ends(160.0, 200.0, [170.0, -175.0]), Ok(([170.0, 185.0], false)));
+        assert_eq!(ends(160.0, 200.0, [-180.0, 180.0]), Ok(([160.0, 200.0], false)));
+        assert_eq!(ends(160.0, 200.0, [100.0, 170.0]), Ok(([160.0, 170.0], false)));
+        assert_eq!(ends(-10.0, 30.0, [0.0, 360.0]), Ok(([-10.0, 30.0], false)));
+        assert_eq!(ends(20.0, 340.0, [-60.0, 60.0]), Ok(([300.0, 420.0], false)));
+        assert_eq!(ends(0.0, 358.0, [-60.0, 60.0]), Ok(([-60.0, 60.0], false)));
+        assert!(ends(0.0, 358.0, [-180.0, 180.0]).unwrap().1);
+        assert!(ends(160.0, 200.0, [0.0, 20.0]).unwrap_err().contains("lies beside it"));
     }
 
     #[test]

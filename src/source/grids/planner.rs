@@ -1,6 +1,7 @@
 //! The planner of one file, and what all plans share.
 
 use super::axes::{AxisPlan, Quantity};
+use super::column_plan::Terrain;
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
 use super::mask::is_of_water;
@@ -175,11 +176,19 @@ impl<'a> Planner<'a> {
         roles: &[(usize, Role)],
         axis: Option<&AxisPlan>,
     ) -> Result<ComponentPlan, SourceError> {
+        let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
+        let factor =
+            self.velocity_factor(candidate, axis, if along_pressure { &[Unit::is_pressure_tendency] } else { &[Unit::is_velocity] })?;
+        self.component_in(candidate, roles, factor)
+    }
+
+    /// The same with a factor to SI.
+    fn component_in(&mut self, candidate: &Candidate, roles: &[(usize, Role)], factor: f64) -> Result<ComponentPlan, SourceError> {
         let variable = self.variable(candidate.variable);
         let roles =
             variable.dimensions.iter().map(|&d| roles.iter().find(|r| r.0 == d).map_or(Role::Fixed(self.entry_of(d)), |r| r.1)).collect();
         Ok(ComponentPlan {
-            factor: self.velocity_factor(candidate, axis)?,
+            factor,
             name: variable.name.clone(),
             shape: self.shape(candidate.variable),
             roles,
@@ -192,22 +201,25 @@ impl<'a> Planner<'a> {
         })
     }
 
-    /// Factor from the unit of a component to SI.
-    pub fn velocity_factor(&mut self, candidate: &Candidate, axis: Option<&AxisPlan>) -> Result<f64, SourceError> {
+    /// Factor from the unit of a component to SI, if it is one of `quantities`.
+    pub fn velocity_factor(
+        &mut self,
+        candidate: &Candidate,
+        axis: Option<&AxisPlan>,
+        quantities: &[fn(&Unit) -> bool],
+    ) -> Result<f64, SourceError> {
         if self.settings.velocity_unit == VelocityUnit::Cells {
             return Ok(1.0);
         }
         let variable = self.variable(candidate.variable);
         let component = candidate.component.name();
         let text = self.settings.unit(component).or(variable.units()).unwrap_or_default();
-        let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
         match Unit::parse(text) {
             Some(u) if u.is_dimensionless() => {
                 self.note(format!("{component}: `{}` has no unit: taken as SI", variable.name));
                 Ok(1.0)
             }
-            Some(u) if u.is_velocity() && !along_pressure => Ok(u.factor),
-            Some(u) if u.is_pressure_tendency() && along_pressure => Ok(u.factor),
+            Some(u) if quantities.iter().any(|is| is(&u)) => Ok(u.factor),
             Some(u) if u.is_velocity() || u.is_pressure_tendency() => {
                 let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
                 let hint = if component == "w" { ", or ignore vertical motion with --set archive.w=none" } else { "" };
@@ -224,15 +236,20 @@ impl<'a> Planner<'a> {
         }
     }
 
-    /// The third component, if it exists and is wanted.
+    /// The third component, if it exists and is wanted. Levels that follow the ground take changes of pressure as well.
     pub fn vertical_component(
         &mut self,
         w: Option<&Candidate>,
         roles: &[(usize, Role)],
         axis: Option<&AxisPlan>,
         three: bool,
+        terrain: Option<&Terrain>,
     ) -> Result<Option<ComponentPlan>, SourceError> {
         match (w, three) {
+            (Some(w), true) if terrain.is_some_and(Terrain::is_of_air) => {
+                let factor = self.velocity_factor(w, axis, &[Unit::is_velocity, Unit::is_pressure_tendency])?;
+                return self.component_in(w, roles, factor).map(Some);
+            }
             (Some(w), true) => return self.component(w, roles, axis).map(Some),
             (Some(w), false) => {
                 self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));

@@ -95,7 +95,7 @@ impl Planner<'_> {
         }
         let mut components =
             vec![self.component(&velocity.u, &roles, Some(&axes[0]))?, self.component(&velocity.v, &roles, Some(&axes[1]))?];
-        components.extend(self.vertical_component(w, &roles, axes.get(2), three)?);
+        components.extend(self.vertical_component(w, &roles, axes.get(2), three, terrain.as_ref())?);
         self.give_columns(&mut components, terrain.as_ref())?;
         let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: None, notes: self.notes })

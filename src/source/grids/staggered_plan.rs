@@ -9,6 +9,7 @@ use super::staggered::{Cells, Reach, Staggered};
 use super::times::TimePlan;
 use crate::archive_settings::{Metric, Staggering, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify_name};
+use crate::cf::units::Unit;
 use crate::cf::velocity::Velocity;
 use crate::error::SourceError;
 use crate::formats::NumberType;
@@ -157,7 +158,7 @@ impl Planner<'_> {
                 self.note("no vertical velocity found: it is taken as 0");
                 continue;
             };
-            let factor = self.velocity_factor(candidate, None)?;
+            let factor = self.velocity_factor(candidate, None, &[Unit::is_velocity])?;
             let plan = self.by_place(candidate.variable, factor, &candidate.why)?;
             // A vertical velocity of fewer dimensions belongs to something else.
             if components.len() < 2 || plan.shape.len() == components[0].shape.len() {

@@ -33,7 +33,9 @@ pub struct Faces {
 const LONGEST: f64 = 3.0;
 /// Area of a triangle, as a share of the square of its longest side, below which it is none.
 const FLAT: f64 = 1e-6;
-/// Squared distance of two points on the unit sphere (0.6 mm on the globe) below which they count as one.
+/// Triangles that are asked how the hull turns: one may be flat.
+const MOST_ASKED: usize = 16;
+/// Half of the squared distance of two points on the unit sphere (0.9 mm on the globe) below which they count as one.
 const ONE_POINT: f64 = 1e-20;
 
 fn cross(a: Vector, b: Vector) -> Vector {
@@ -120,12 +122,13 @@ impl Triangles {
             let own = triangle.map(|p| shortest[p as usize][2]).into_iter().fold(0.0, f64::max);
             sides(triangle).iter().all(|&(a, b)| length(a, b) <= LONGEST * own)
         });
+        keep_near_side(&points, &mut corners);
         Self { corners, faces: None }
     }
 
-    /// Between the middles of faces, which tell where water is.
+    /// Between the middles of faces, which tell where water is. Where no triangle is, beside the coast, the value is that of the face.
     pub fn between_faces(longitude: &[f64], latitude: &[f64], faces: Faces) -> Self {
-        Self { corners: delaunay(longitude, latitude).1, faces: Some(faces) }
+        Self { faces: Some(faces), ..Self::without_gaps(longitude, latitude) }
     }
 
     /// Longitudes and latitudes of the nodes of the faces in which the points lie.
@@ -195,6 +198,21 @@ fn delaunay(longitude: &[f64], latitude: &[f64]) -> (Vec<Vector>, Vec<[u32; 3]>)
         triangles.push([next, here, centre]);
     }
     (points, triangles)
+}
+
+/// Leaves out the triangles behind the points of a part of the globe, which close their hull: seen from the middle of the globe they turn the other way.
+fn keep_near_side(points: &[Vector], triangles: &mut Vec<[u32; 3]>) {
+    // The hull lies below each triangle that turns counter-clockwise, seen from outside.
+    let above = |triangle: &[u32; 3]| {
+        let [a, b, c] = triangle.map(|n| points[n as usize]);
+        let normal = cross(between(a, b), between(a, c));
+        points.iter().map(|&p| dot(between(a, p), normal)).filter(|d| d.is_finite()).sum::<f64>()
+    };
+    let turn = triangles.iter().take(MOST_ASKED).map(above).fold(0.0, |most: f64, sum| if sum.abs() > most.abs() { sum } else { most });
+    triangles.retain(|triangle| {
+        let [a, b, c] = triangle.map(|n| points[n as usize]);
+        dot(a, cross(b, c)) * turn < 0.0
+    });
 }
 
 /// Linear interpolation in triangles.
@@ -329,11 +347,37 @@ mod tests {
         let (points, triangles) = delaunay(&longitude, &latitude);
         let turn = |t: &[u32; 3]| dot(points[t[0] as usize], cross(points[t[1] as usize], points[t[2] as usize])).signum();
         assert!(triangles.iter().all(|t| turn(t) == turn(&triangles[0])));
+        let mut near = triangles.clone();
+        keep_near_side(&points, &mut near);
+        assert_eq!(near, triangles, "nothing lies behind the points of a globe");
         // No point lies in the circle of a triangle: beyond the plane of its corners.
         for t in &triangles {
             let [a, b, c] = t.map(|n| points[n as usize]);
             let normal = cross(between(a, b), between(a, c)).map(|v| v * turn(t));
             assert!(points.iter().all(|&p| dot(between(a, p), normal) <= 1e-12), "{t:?}");
+        }
+    }
+
+    /// The triangles that close the hull of a part of the globe lie behind it, whichever point is the first.
+    #[test]
+    fn a_part_of_the_globe_has_no_triangles_behind_it() {
+        let places: Vec<[f64; 2]> = (0..40 * 30)
+            .map(|n| {
+                [f64::from(n % 40) + 0.3 * f64::from(n * 7 % 11) / 11.0, f64::from(n / 40) - 15.0 + 0.3 * f64::from(n * 5 % 13) / 13.0]
+            })
+            .collect();
+        for first in [0, 20, 615, 1199, 333] {
+            let mut places = places.clone();
+            places.swap(0, first);
+            let points: [Vec<f64>; 2] = [0, 1].map(|k| places.iter().map(|p| p[k]).collect());
+            let (all, triangles) = delaunay(&points[0], &points[1]);
+            let mut near = triangles.clone();
+            keep_near_side(&all, &mut near);
+            // All but those beyond the rim.
+            assert!((2200..2400).contains(&near.len()) && near.len() < triangles.len(), "{first}: {} of {}", near.len(), triangles.len());
+            let (worst, _) = error(&mesh(points.clone(), Triangles::without_gaps(&points[0], &points[1])), 0.5);
+            // Triangles at the rim are up to four degrees long: an eighth of the square, 6e-4, times the second derivative, 9.
+            assert!(worst < 6e-3, "{first}: {worst}");
         }
     }
 

@@ -6,15 +6,20 @@ use super::curvilinear_plan::{Cells, POINT_BYTES, Pair, Points};
 use super::locator::Mesh;
 use super::planner::Planner;
 use super::triangles::{Faces, Triangles};
+use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
 use crate::cf::velocity::Velocity;
 use crate::error::SourceError;
-use crate::formats::{Listing, Variable};
+use crate::formats::{Attribute, Listing, Variable};
 
 /// Names of nodes at the corners of faces, for files without `cf_role`.
 const FACE_NAMES: [&str; 8] =
     ["nv", "elements", "elem", "element", "face_nodes", "vertex_of_cell", "schism_hgrid_face_nodes", "mesh2d_face_nodes"];
+/// Kinds of features along one dimension that are no mesh (CF conventions, chapter 9).
+const FEATURES: [&str; 6] = ["point", "timeseries", "trajectory", "profile", "timeseriesprofile", "trajectoryprofile"];
+/// Bytes of a corner of a face while faces are read.
+const CORNER_BYTES: u64 = 40;
 /// Corners that a face may have.
 const CORNERS: std::ops::RangeInclusive<usize> = 3..=16;
 
@@ -30,8 +35,7 @@ struct Connectivity {
 fn connectivities(listing: &Listing) -> Vec<Connectivity> {
     let found = |variable: usize| {
         let of = &listing.variables[variable];
-        // The file that it comes from may follow its name.
-        let name = of.name.split(' ').next().unwrap_or_default().to_ascii_lowercase();
+        let name = of.name.to_ascii_lowercase();
         let named = of.text("cf_role").map_or_else(|| FACE_NAMES.contains(&name.as_str()), |role| role == "face_node_connectivity");
         let [a, b] = of.dimensions[..] else { return None };
         let (corners, faces) = if listing.dimensions[a].len < listing.dimensions[b].len { (a, b) } else { (b, a) };
@@ -68,11 +72,43 @@ impl Planner<'_> {
     /// # Errors
     /// A mesh that cannot be read, or is not in degrees; v or w that lie on no mesh.
     pub fn unstructured_points(&mut self, velocity: &Velocity) -> Result<Option<Vec<Points>>, SourceError> {
+        let feature = match self.listing().attribute("featureType") {
+            Some(Attribute::Text(text)) => text.trim().to_ascii_lowercase(),
+            _ => String::new(),
+        };
+        if FEATURES.contains(&feature.as_str()) {
+            return Ok(None);
+        }
         let Some(u) = self.mesh_points(velocity.u.variable)? else { return Ok(None) };
+        let s = self.settings;
+        if let Some(metric) = s.metric.filter(|metric| *metric != Metric::Sphere) {
+            return Err(SourceError::setting("metric", format!("{metric:?}"), "\"sphere\", the only one of an unstructured mesh"));
+        }
+        if s.velocity_unit != VelocityUnit::Si {
+            return Err(SourceError::setting("velocity_unit", "cells", "\"si\": an unstructured mesh has no cells to count"));
+        }
         let mut found = vec![u];
+        let dimensions = |i: usize| &self.variable(i).dimensions;
         for other in [Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten() {
+            // Faces are read once.
+            if dimensions(other.variable) == dimensions(velocity.u.variable)
+                && self.file.origin(other.variable).0 == self.file.origin(velocity.u.variable).0
+            {
+                found.push(u);
+                continue;
+            }
             let lost = || self.misfit(other.variable, "it lies on no points of the mesh on which u lies");
             found.push(self.mesh_points(other.variable)?.ok_or_else(lost)?);
+        }
+        let turned_back = self.listing().attribute("FESOM_autorotate_back_to_geo");
+        if turned_back.is_some_and(|a| {
+            matches!(a, Attribute::Numbers(_, v) if v.first() == Some(&0.0))
+                || matches!(a, Attribute::Text(t) if ["0", "F", ".false."].contains(&t.trim()))
+        }) {
+            self.note(
+                "WARNING: FESOM wrote these vectors along its own rotated axes (`FESOM_autorotate_back_to_geo` is 0); they are read as east and north: turn \
+                 them first, or write them with `vec_autorotate = .true.`",
+            );
         }
         if found[0].cells == Cells::Unknown {
             let [longitude, latitude] = found[0].pair.map(|i| self.variable(i).name.clone());
@@ -84,25 +120,42 @@ impl Planner<'_> {
         Ok(Some(found))
     }
 
+    /// True along the points or the faces of a mesh.
+    pub fn is_along_mesh(&self, dimension: usize) -> bool {
+        let listing = self.listing();
+        pairs(listing).iter().any(|(d, _)| *d == dimension) || connectivities(listing).iter().any(|c| c.faces == dimension)
+    }
+
     fn mesh_points(&self, variable: usize) -> Result<Option<Points>, SourceError> {
         let listing = self.listing();
         let (pairs, faces) = (pairs(listing), connectivities(listing));
         let named = self.named_points();
+        let length = |d: usize| listing.dimensions[d].len;
         let pair_on = |dimension: usize| {
             let named = named.filter(|pair| self.variable(pair[0]).dimensions == [dimension]);
             named.or_else(|| pairs.iter().find(|(d, _)| *d == dimension).map(|(_, pair)| *pair))
         };
-        // The last dimension that fits: before it come times and levels.
+        let location = self.variable(variable).text("location").unwrap_or_default();
+        // The last dimension that fits: times and levels come before it, or levels after it.
         for &dimension in self.variable(variable).dimensions.iter().rev() {
-            if listing.dimensions[dimension].len < 3 || self.measured(dimension).kind == Kind::Time {
+            if length(dimension) < 3 || self.measured(dimension).kind == Kind::Time {
                 continue;
             }
             let own = pair_on(dimension);
-            // Of nodes and faces of one number, the names of dimensions tell.
-            if let Some(of) = faces.iter().find(|c| c.faces == dimension)
-                && let Some((nodes, greatest)) = self.nodes_of(*of, dimension, &pairs)?
+            // The dimension of the mesh may have another name in a file of its own.
+            let same_length = |c: &&Connectivity| own.is_some() && length(c.faces) == length(dimension);
+            let around =
+                faces.iter().find(|c| c.faces == dimension).or_else(|| faces.iter().find(same_length)).filter(|_| location != "node");
+            if own.is_none() && around.is_none() {
+                continue;
+            }
+            if location == "edge" {
+                return Err(self.misfit(variable, "its values lie at the sides of faces; accepted are values at nodes and in faces"));
+            }
+            if let Some(of) = around
+                && let Some((nodes_on, nodes)) = self.nodes_of(*of, &pairs)?
+                && nodes_on != dimension
             {
-                self.check_room(of.variable, greatest)?;
                 let cells = Cells::InFaces { faces: of.variable, nodes };
                 return Ok(Some(Points { pair: own.unwrap_or(nodes), plane: [dimension; 2], between: [false; 2], cells }));
             }
@@ -112,9 +165,10 @@ impl Planner<'_> {
                 return Err(self.misfit(odd, "points of an unstructured mesh have to be longitudes and latitudes in degrees or radians"));
             }
             let mut cells = Cells::Unknown;
-            for of in faces.iter().filter(|c| c.faces != dimension) {
-                if self.greatest(*of)?.is_some_and(|greatest| greatest < listing.dimensions[dimension].len) {
+            for of in faces.iter().filter(|c| c.faces != dimension && location != "face") {
+                if self.nodes_of(*of, &pairs)?.is_some_and(|(on, _)| on == dimension) {
                     cells = Cells::AtNodes { faces: of.variable };
+                    break;
                 }
             }
             return Ok(Some(Points { pair, plane: [dimension; 2], between: [false; 2], cells }));
@@ -122,17 +176,13 @@ impl Planner<'_> {
         Ok(None)
     }
 
-    /// Coordinates of the nodes of faces, and the number of the last node that a face has.
-    fn nodes_of(&self, of: Connectivity, faces: usize, pairs: &[(usize, Pair)]) -> Result<Option<(Pair, usize)>, SourceError> {
-        let Some(greatest) = self.greatest(of)? else { return Ok(None) };
+    /// Dimension and coordinates of the nodes of faces: those of the fewest points among which all corners are.
+    fn nodes_of(&self, of: Connectivity, pairs: &[(usize, Pair)]) -> Result<Option<(usize, Pair)>, SourceError> {
+        let greatest = self.corners(of)?.into_iter().flatten().max();
+        let Some(greatest) = greatest.map(|node| node as usize) else { return Ok(None) };
         let length = |d: usize| self.listing().dimensions[d].len;
-        let fitting = pairs.iter().filter(|(d, _)| *d != faces && greatest < length(*d));
-        Ok(fitting.min_by_key(|(d, _)| length(*d)).map(|(_, pair)| (*pair, greatest)))
-    }
-
-    /// The greatest number of a node at a corner, counted from 0.
-    fn greatest(&self, of: Connectivity) -> Result<Option<usize>, SourceError> {
-        Ok(self.corners(of)?.into_iter().flatten().max().map(|node| node as usize))
+        let fitting = pairs.iter().filter(|(d, _)| *d != of.faces && greatest < length(*d));
+        Ok(fitting.min_by_key(|(d, _)| length(*d)).copied())
     }
 
     /// Nodes at the corners of all faces, counted from 0, face after face.
@@ -140,17 +190,18 @@ impl Planner<'_> {
         let (variable, listing) = (self.variable(of.variable), self.listing());
         let [faces, width] = [of.faces, of.corners].map(|d| listing.dimensions[d].len);
         listing.check_count(variable, &[faces, width])?;
-        self.check_room(of.variable, faces.saturating_mul(width))?;
+        self.check_room(of.variable, faces.saturating_mul(width), CORNER_BYTES)?;
         let packing = self.packing(of.variable)?;
         let mut values: Vec<f64> = self.file.read_all(of.variable)?.into_iter().map(|v| packing.unpack(v)).collect();
         if variable.dimensions[0] == of.corners {
             values = (0..faces).flat_map(|face| (0..width).map(move |k| k * faces + face)).map(|n| values[n]).collect();
         }
         let known = |v: &&f64| v.is_finite() && **v >= 0.0;
-        let least = values.iter().filter(known).fold(f64::INFINITY, |a, &b| a.min(b));
-        // Models count from 1, unless a 0 is there: then it may fill up faces of fewer corners only where the conventions are followed.
+        let (least, greatest) = values.iter().filter(known).fold((f64::INFINITY, 0.0f64), |(a, b), &v| (a.min(v), b.max(v)));
+        // Models count from 1, unless a 0 is there which does not only fill up faces of fewer corners.
+        let is_full = || pairs(listing).iter().any(|(d, _)| listing.dimensions[*d].len as f64 == greatest);
         let stated = variable.numbers("start_index").first().copied();
-        let start = stated.unwrap_or(if least == 0.0 { 0.0 } else { 1.0 });
+        let start = stated.unwrap_or_else(|| if least == 0.0 && !is_full() { 0.0 } else { 1.0 });
         let node = |v: f64| {
             let node = v - start;
             (node >= 0.0 && node < f64::from(u32::MAX) && node.fract() == 0.0).then_some(node as u32)
@@ -158,8 +209,8 @@ impl Planner<'_> {
         Ok(values.into_iter().map(node).collect())
     }
 
-    fn check_room(&self, variable: usize, points: usize) -> Result<(), SourceError> {
-        let needed = (points as u64).saturating_mul(POINT_BYTES);
+    fn check_room(&self, variable: usize, points: usize, each: u64) -> Result<(), SourceError> {
+        let needed = (points as u64).saturating_mul(each);
         self.file.limits.check(needed, &format!("{points} points of a mesh")).map_err(|what| self.misfit(variable, what))
     }
 
@@ -168,7 +219,7 @@ impl Planner<'_> {
         for index in [longitude, latitude] {
             let shape = self.shape(index);
             self.listing().check_count(self.variable(index), &shape)?;
-            self.check_room(index, shape[0])?;
+            self.check_room(index, shape[0], POINT_BYTES)?;
         }
         let places = [self.degrees(longitude, None)?, self.degrees(latitude, None)?];
         self.check_latitudes(latitude, &places[1])?;

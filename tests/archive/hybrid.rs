@@ -1,0 +1,158 @@
+//! Levels that follow the ground, of CMIP, CAM and models with plain sigma levels: the wind is proportional to the height of the isothermal
+//! atmosphere, so that a value tells the height from which it was read, and the change of pressure is that of a steady ascent.
+
+use crate::kit::netcdf::*;
+use crate::{HOURS, notes, open, open_with, refused};
+use ridgewatch::source::{Archive, SnapshotSource};
+use std::path::{Path, PathBuf};
+use tempfile::tempdir;
+
+const LON: [f64; 6] = [10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
+const LAT: [f64; 4] = [43.0, 42.0, 41.0, 40.0];
+/// From the top downwards, as models count them.
+const A: [f64; 5] = [0.05, 0.2, 0.18, 0.05, 0.0];
+const B: [f64; 5] = [0.0, 0.1, 0.45, 0.85, 0.99];
+/// m/s
+const ASCENT: f64 = 0.03;
+
+/// How the file says where its levels lie.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Says {
+    /// a, b and p0, in hPa.
+    Shares,
+    /// a in Pa.
+    Pressures,
+    /// Sigma below a pressure at the top.
+    Sigma,
+}
+
+/// Pressure at the ground: a mountain in the east, and a change with time.
+fn ground(time: usize, lon: f64) -> f64 {
+    101_000.0 - 4000.0 * (lon - 10.0) - 150.0 * time as f64
+}
+
+fn pressure(says: Says, level: usize, ground: f64) -> f64 {
+    match says {
+        Says::Shares | Says::Pressures => A[level] * 1e5 + B[level] * ground,
+        Says::Sigma => 2000.0 + B[level] * (ground - 2000.0),
+    }
+}
+
+fn height(pressure: f64) -> f64 {
+    -7000.0 * (pressure / 1e5).ln()
+}
+
+fn write(path: &Path, says: Says, vertical: &str) -> PathBuf {
+    let (levels, ny, nx) = (A.len(), LAT.len(), LON.len());
+    let dims = ["time", "lev", "lat", "lon"];
+    let (name, terms) = match says {
+        Says::Shares => ("atmosphere_hybrid_sigma_pressure_coordinate", "p0: p0 a: a b: b ps: PS"),
+        Says::Pressures => ("atmosphere_hybrid_sigma_pressure_coordinate", "ap: ap b: b ps: PS"),
+        Says::Sigma => ("atmosphere_sigma_coordinate", "sigma: lev ps: PS ptop: top"),
+    };
+    let mut file = Fixture::new(NETCDF4, &[("time", 2), ("lev", levels), ("lat", ny), ("lon", nx)])
+        .axis("time", HOURS, &[0.0, 3.0])
+        .axis("lat", "degrees_north", &LAT)
+        .axis("lon", "degrees_east", &LON)
+        .axis("lev", "1", &B)
+        .with("standard_name", name)
+        .with("positive", "down")
+        .with("formula_terms", terms);
+    file = match says {
+        Says::Shares => file
+            .variable("a", &["lev"], Data::F64(A.to_vec()))
+            .variable("b", &["lev"], Data::F64(B.to_vec()))
+            .variable("p0", &[], Data::F64(vec![1000.0]))
+            .with("units", "hPa"),
+        Says::Pressures => {
+            let fixed = A.iter().map(|a| a * 1e5).collect();
+            file.variable("ap", &["lev"], Data::F64(fixed)).with("units", "Pa").variable("b", &["lev"], Data::F64(B.to_vec()))
+        }
+        Says::Sigma => file.variable("top", &[], Data::F64(vec![20.0])).with("units", "hPa"),
+    };
+    let plane = (0..2 * ny * nx).map(|n| ground(n / (ny * nx), LON[n % nx])).collect();
+    file = file.variable("PS", &["time", "lat", "lon"], Data::F64(plane)).with("units", "Pa");
+    let at = |n: usize| pressure(says, n / (ny * nx) % levels, ground(n / (levels * ny * nx), LON[n % nx]));
+    let all = |of: &dyn Fn(f64) -> f64| f32s((0..2 * levels * ny * nx).map(|n| of(at(n))).collect());
+    file = file.variable("U", &dims, all(&|p| height(p) / 1000.0)).with("units", "m/s");
+    file = file.variable("V", &dims, all(&|_| 2.0)).with("units", "m/s");
+    let rising: &dyn Fn(f64) -> f64 = if vertical == "Pa/s" { &|p| -ASCENT * p / 7000.0 } else { &|_| ASCENT };
+    file.variable("OMEGA", &dims, all(rising)).with("units", vertical).write(path)
+}
+
+/// Checks all known nodes at a time; their share, and that of nodes above the ground.
+fn shares(archive: &mut Archive, time: usize) -> [f64; 2] {
+    let snapshot = archive.read(time).unwrap();
+    let axes = &snapshot.grid.axes;
+    let (nx, ny) = (axes[0].len(), axes[1].len());
+    let (mut known, mut above) = (0, 0);
+    for (n, node) in snapshot.nodes.iter().enumerate() {
+        let (lon, z) = (axes[0].coordinates()[n % nx], axes.get(2).map_or(3000.0, |axis| axis.coordinates()[n / (nx * ny)]));
+        let surface = height(ground(time, lon));
+        above += usize::from(z > surface);
+        if node[3].is_nan() {
+            continue;
+        }
+        known += 1;
+        let speed = (0..3).map(|k| f64::from(node[k]).powi(2)).sum::<f64>().sqrt();
+        // Near the ground and the top the wind is that of the nearest level.
+        let found = (speed * speed - 4.0).max(0.0).sqrt() * 1000.0;
+        let lowest = height(pressure(Says::Shares, A.len() - 1, ground(time, lon))).min(height(pressure(
+            Says::Sigma,
+            A.len() - 1,
+            ground(time, lon),
+        )));
+        assert!((found - z).abs() < 2.0 || z < lowest + 250.0 || z > 15_000.0, "{z} m: {found}");
+        assert!(axes.len() < 3 || (f64::from(node[3]) - ASCENT).abs() < 1e-4, "{z} m: {}", node[3]);
+        assert!(z > surface - 1.0, "{z} m is below the ground at {surface}");
+    }
+    [known, above].map(|count| f64::from(count as u32) / snapshot.nodes.len() as f64)
+}
+
+#[test]
+fn winds_come_from_their_true_height() {
+    let dir = tempdir().unwrap();
+    for (says, vertical) in [(Says::Shares, "Pa/s"), (Says::Pressures, "m/s"), (Says::Sigma, "Pa/s")] {
+        let file = write(&dir.path().join(format!("{says:?}.nc")), says, vertical);
+        let mut archive = open(&[&file]);
+        let z = archive.grid().axes[2].coordinates().to_vec();
+        assert!(z.len() == 5 && z.windows(2).all(|w| w[0] < w[1]) && z[0] > 0.0 && z[4] > 15_000.0, "{says:?}: {z:?}");
+        for time in 0..2 {
+            let [known, above] = shares(&mut archive, time);
+            println!("{says:?}: {known:.3} known, {above:.3} above the ground");
+            assert!((known - above).abs() < 1e-9 && above < 1.0, "{says:?}: {known} {above}");
+        }
+        let all = notes(&archive);
+        assert!(all.contains("`lev` follows the ground") && all.contains("pressure at the ground `PS`"), "{all}");
+        // One height, and others.
+        let mut one = open_with(&[&file], "level = 3000");
+        assert_eq!(one.grid().axes.len(), 2);
+        shares(&mut one, 1);
+        let mut few = open_with(&[&file], "heights = [1500, 3000, 5000]");
+        assert_eq!(few.grid().axes[2].coordinates(), [1500.0, 3000.0, 5000.0]);
+        shares(&mut few, 0);
+        refused(&[&file], "level = 90000", &["level", "heights in metres: from", "at the lowest ground"]);
+    }
+}
+
+#[test]
+fn levels_without_the_pressure_at_the_ground_say_what_is_missing() {
+    let dir = tempdir().unwrap();
+    let file = write(&dir.path().join("whole.nc"), Says::Shares, "Pa/s");
+    let whole = open(&[&file]);
+    assert!(!notes(&whole).contains("not in the files"));
+    let bare = Fixture::new(NETCDF4, &[("time", 2), ("lev", 3), ("lat", 2), ("lon", 2)])
+        .axis("time", HOURS, &[0.0, 3.0])
+        .axis("lat", "degrees_north", &[1.0, 2.0])
+        .axis("lon", "degrees_east", &[1.0, 2.0])
+        .axis("lev", "1", &[0.2, 0.5, 0.9])
+        .with("standard_name", "atmosphere_hybrid_sigma_pressure_coordinate")
+        .with("formula_terms", "p0: p0 a: a b: b ps: PS")
+        .variable("U", &["time", "lev", "lat", "lon"], f32s(vec![1.0; 24]))
+        .with("units", "m/s")
+        .variable("V", &["time", "lev", "lat", "lon"], f32s(vec![1.0; 24]))
+        .with("units", "m/s")
+        .write(&dir.path().join("bare.nc"));
+    let archive = open(&[&bare]);
+    assert!(notes(&archive).contains("the pressure there, `PS`, is not in the files"), "{}", notes(&archive));
+}
