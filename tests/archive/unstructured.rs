@@ -266,6 +266,19 @@ fn names_and_orders_of_models() {
         assert!((f64::from(node[3]) - exact).abs() < 1e-5, "{} {exact}", node[3]);
     }
 
+    // SCHISM: coordinates whose names say nothing, which are named.
+    let fixture = times(&[("nSCHISM_hgrid_face", faces.len()), ("node", nodes.len()), ("four", 4)]);
+    let all = faces.iter().flatten().map(|&n| (n + 1) as f64).collect();
+    let fixture = fixture.variable("SCHISM_hgrid_face_nodes", &["nSCHISM_hgrid_face", "four"], Data::F64(all)).with("start_index", 1);
+    let mut fixture = coordinates(fixture, "node", ["SCHISM_hgrid_node_x", "SCHISM_hgrid_node_y"], &nodes, false);
+    fixture.variables.iter_mut().filter(|v| v.name.contains("_node_")).for_each(|v| v.attributes.clear());
+    for (c, name) in ["horizontalVelX", "horizontalVelY"].into_iter().enumerate() {
+        let values = (0..2 * nodes.len()).map(|i| rotation(nodes[i % nodes.len()])[c]).collect();
+        fixture = fixture.variable(name, &["time", "node"], f32s(values)).with("units", "m/s");
+    }
+    let named = "x = \"SCHISM_hgrid_node_x\"\ny = \"SCHISM_hgrid_node_y\"";
+    check_basin("SCHISM", &mut open_with(&[written(dir.path(), "schism.nc", fixture)], named), 1e-4);
+
     let mut sides = velocities(coordinates(times(&[("edge", count)]), "edge", ["lon", "lat"], &middles, false), "edge", &middles, &[]);
     sides.variables.iter_mut().filter(|v| v.name == "u").for_each(|v| v.attributes.push(("location".into(), "edge".into())));
     refused(&[written(dir.path(), "edges.nc", sides)], "", &["sides of faces"]);

@@ -128,13 +128,11 @@ impl Planner<'_> {
 
     fn mesh_points(&self, variable: usize) -> Result<Option<Points>, SourceError> {
         let listing = self.listing();
-        let (pairs, faces) = (pairs(listing), connectivities(listing));
-        let named = self.named_points();
+        let (mut pairs, faces) = (pairs(listing), connectivities(listing));
+        // Those that are named go first.
+        pairs.splice(..0, self.named_points().map(|pair| (self.variable(pair[0]).dimensions[0], pair)));
         let length = |d: usize| listing.dimensions[d].len;
-        let pair_on = |dimension: usize| {
-            let named = named.filter(|pair| self.variable(pair[0]).dimensions == [dimension]);
-            named.or_else(|| pairs.iter().find(|(d, _)| *d == dimension).map(|(_, pair)| *pair))
-        };
+        let pair_on = |dimension: usize| pairs.iter().find(|(d, _)| *d == dimension).map(|(_, pair)| *pair);
         let location = self.variable(variable).text("location").unwrap_or_default();
         // The last dimension that fits: times and levels come before it, or levels after it.
         for &dimension in self.variable(variable).dimensions.iter().rev() {
