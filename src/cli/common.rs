@@ -110,6 +110,12 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
         messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
         return Ok(Some(Decision::new("render.method", "two_level", why)));
     }
+    if scene.archive.follow.is_some() {
+        scene.render.method = Method::TwoLevel;
+        let why = "an archive that is followed may have no window yet to try methods on";
+        messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
+        return Ok(Some(Decision::new("render.method", "two_level", why)));
+    }
     let files = if scene.archive.files.is_empty() {
         Vec::new()
     } else {

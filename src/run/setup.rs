@@ -169,10 +169,11 @@ impl Setup {
             None => refused,
         })?;
         scene.surrogate.check_nodes(domain.dimensions)?;
+        let followed = scene.source.kind == SourceKind::Archive && scene.archive.follow.is_some();
         // After the checks that read nothing.
         if let (None, Some(source), Some(grid)) = (&scene.time.tau, &mut snapshots, &grid) {
             let (times, nodes) = (source.times().to_vec(), grid.nodes());
-            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes)).is_ok();
+            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes, followed)).is_ok();
             let (tau, why) = default_tau(&mut **source, &map, fits)?;
             let unit = source.describe().time_unit;
             let words = if unit == "s" { in_words(tau) } else { String::new() };
@@ -190,14 +191,14 @@ impl Setup {
             && let (Some(times), Some(grid)) = (&times, &grid)
         {
             // Before the first snapshot is read.
-            scene.archive.check_window(window_bytes(times, tau, grid.nodes()))?;
+            scene.archive.check_window(window_bytes(times, tau, grid.nodes(), followed))?;
         }
         let slides = match live {
             Some(live) => live_slides(&scene, live.follow(tau, scene.time.snapshots_per_slide)?, direction),
             None => open_slides(&scene, snapshots, tau, direction)?,
         };
         if let (Some(times), Some(grid)) = (&times, &grid) {
-            notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), ridgewatch_base::memory::available()));
+            notes.extend(memory::short(window_bytes(times, tau, grid.nodes(), followed), ridgewatch_base::memory::available()));
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
@@ -217,8 +218,15 @@ fn in_words(seconds: f64) -> String {
 }
 
 /// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.
-fn window_bytes(times: &[f64], tau: f64, nodes: usize) -> u64 {
-    let snapshots = (window_snapshots(times, tau) + DEFAULT_READ_AHEAD + 1).min(times.len());
+fn window_bytes(times: &[f64], tau: f64, nodes: usize, is_followed: bool) -> u64 {
+    let known = (window_snapshots(times, tau) + DEFAULT_READ_AHEAD + 1).min(times.len());
+    // More may come, as far apart as those that are there.
+    let interval = match times {
+        [first, .., last] => (last - first) / (times.len() - 1) as f64,
+        _ => f64::INFINITY,
+    };
+    let coming = if is_followed { (tau / interval).ceil() as usize + 1 + DEFAULT_READ_AHEAD + 1 } else { 0 };
+    let snapshots = known.max(coming);
     (snapshots as u64).saturating_mul(nodes as u64).saturating_mul(size_of::<[f32; 4]>() as u64)
 }
 
@@ -232,6 +240,10 @@ fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, directio
         (_, SourceKind::Live) => {
             let found = "is missing, and a running simulation does not say when it will end";
             return Err(Refused::new("network.start_range", found, "two times, ascending").beside(&["network.inputs"]));
+        }
+        (Some(_), SourceKind::Archive) if scene.archive.follow.is_some() => {
+            let found = "is missing, and an archive that is followed does not say when it will end";
+            return Err(Refused::new("network.start_range", found, "two times, ascending").beside(&["network.inputs", "archive.follow"]));
         }
         (Some(times), _) => {
             let (first, last) = (times.first().copied().unwrap_or(0.0), times.last().copied().unwrap_or(0.0));

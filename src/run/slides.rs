@@ -230,7 +230,8 @@ impl Slides for ArchiveSlides {
     }
 
     fn is_awaited(&self) -> Option<bool> {
-        self.follows.then(|| self.reader.is_followed() && self.reader.remaining() == 0)
+        // Between two slides the window is full.
+        self.follows.then(|| self.reader.is_waiting_for(self.stride))
     }
 
     fn is_over(&self) -> bool {

@@ -47,6 +47,77 @@ fn followed(dir: &Path, pattern: &str, longest: Duration) -> ReadAhead {
     follow(Box::new(archive), 2, longest)
 }
 
+/// Warnings of the looks, as soon as there are some.
+fn warnings(reader: &ReadAhead) -> Vec<String> {
+    let begin = Instant::now();
+    let mut found = Vec::new();
+    while found.is_empty() && begin.elapsed() < LONGEST {
+        std::thread::sleep(Duration::from_millis(50));
+        found.extend(reader.arrived().warnings);
+    }
+    found
+}
+
+/// Files that settle at the same look are read by their times, not by their names; one that has grown before its turn is read as it was planned, and
+/// then on.
+#[test]
+fn names_and_turns_do_not_matter() {
+    let dir = tempdir().unwrap();
+    put(dir.path(), "run_1.nc", &fixture(&[1.0, 2.0, 3.0, 4.0, 5.0], &["u", "v"]));
+    put(dir.path(), "run_2.nc", &fixture(&[6.0], &["u", "v"]));
+    let mut reader = followed(dir.path(), "*.nc", LONGEST);
+    // At most two wait, and one is in hand.
+    put(dir.path(), "run_2.nc", &fixture(&[6.0, 7.0], &["u", "v"]));
+    assert_eq!(next(&mut reader, 7), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
+    for (name, day) in [("run_10.nc", 9.0), ("run_9.nc", 8.0)] {
+        put(dir.path(), name, &fixture(&[day], &["u", "v"]));
+    }
+    assert_eq!(next(&mut reader, 2), [8.0, 9.0]);
+    assert_eq!(reader.arrived().warnings, Vec::<String>::new());
+    // A store that comes later.
+    let store = dir.path().join("x.nc");
+    std::fs::create_dir(&store).unwrap();
+    std::fs::write(store.join(".zgroup"), "{\"zarr_format\": 2}").unwrap();
+    let found = warnings(&reader);
+    assert!(found.len() == 1 && found[0].contains("x.nc: a Zarr store is not followed"), "{found:?}");
+}
+
+/// A file of HDF5 to which another handle appends.
+#[test]
+fn records_that_are_appended_are_read() {
+    let dir = tempdir().unwrap();
+    let path = dir.path().join("grows.nc");
+    let write = |day: usize, file: &mut netcdf::FileMut| {
+        let value = |name: &str| if name == "u" { day as f32 } else { 0.5 };
+        file.variable_mut("time").unwrap().put_values(&[day as f64], [day - 1..day]).unwrap();
+        for name in ["u", "v"] {
+            file.variable_mut(name).unwrap().put_values(&[value(name); 12], (day - 1..day, 0..3, 0..4)).unwrap();
+        }
+    };
+    {
+        let mut file = netcdf::create(&path).unwrap();
+        file.add_unlimited_dimension("time").unwrap();
+        for (name, units, values) in [("lat", "degrees_north", &[10.0, 11.0, 12.0][..]), ("lon", "degrees_east", &[5.0, 6.0, 7.0, 8.0])] {
+            file.add_dimension(name, values.len()).unwrap();
+            let mut variable = file.add_variable::<f64>(name, &[name]).unwrap();
+            variable.put_attribute("units", units).unwrap();
+            variable.put_values(values, ..).unwrap();
+        }
+        file.add_variable::<f64>("time", &["time"]).unwrap().put_attribute("units", DAYS).unwrap();
+        for name in ["u", "v"] {
+            file.add_variable::<f32>(name, &["time", "lat", "lon"]).unwrap().put_attribute("units", "m/s").unwrap();
+        }
+        write(1, &mut file);
+        write(2, &mut file);
+    }
+    let mut reader = followed(dir.path(), "*.nc", LONGEST);
+    assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
+    write(3, &mut netcdf::append(&path).unwrap());
+    assert_eq!(next(&mut reader, 1), [3.0]);
+    write(4, &mut netcdf::append(&path).unwrap());
+    assert_eq!(next(&mut reader, 1), [4.0]);
+}
+
 #[test]
 fn files_that_come_and_files_that_grow_are_read_on() {
     let dir = tempdir().unwrap();
@@ -68,12 +139,7 @@ fn files_that_come_and_files_that_grow_are_read_on() {
     assert_eq!(reader.arrived().warnings, Vec::<String>::new());
     // What cannot be read is told once, and read when it has changed.
     std::fs::write(dir.path().join("c.nc"), "no data yet").unwrap();
-    let begin = Instant::now();
-    let mut warnings = Vec::new();
-    while warnings.is_empty() && begin.elapsed() < LONGEST {
-        std::thread::sleep(Duration::from_millis(50));
-        warnings.extend(reader.arrived().warnings);
-    }
+    let warnings = warnings(&reader);
     assert!(warnings.len() == 1 && warnings[0].contains("c.nc") && warnings[0].contains("not read, until it changes"), "{warnings:?}");
     put(dir.path(), "c.nc", &fixture(&[7.0], &["u", "v"]));
     assert_eq!(next(&mut reader, 1), [7.0]);
@@ -96,12 +162,7 @@ fn components_in_files_of_their_own_are_read_once_all_are_there() {
     let mut reader = followed(dir.path(), "*.nc", LONGEST);
     assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
     put(dir.path(), "2u.nc", &fixture(&[3.0], &["u"]));
-    let begin = Instant::now();
-    let mut warnings = Vec::new();
-    while warnings.is_empty() && begin.elapsed() < LONGEST {
-        std::thread::sleep(Duration::from_millis(50));
-        warnings.extend(reader.arrived().warnings);
-    }
+    let warnings = warnings(&reader);
     assert!(warnings.len() == 1 && warnings[0].contains("not read yet") && warnings[0].contains("2u.nc"), "{warnings:?}");
     put(dir.path(), "2v.nc", &fixture(&[3.0], &["v"]));
     assert_eq!(next(&mut reader, 1), [3.0]);
@@ -124,5 +185,6 @@ fn waiting_ends_after_the_longest_time_and_when_nobody_reads() {
     std::fs::write(store.join(".zgroup"), "{\"zarr_format\": 2}").unwrap();
     refused(&[store], "follow = 5", &["follow", "Zarr store", "with files"]);
     refused(&[dir.path().join("a.nc")], "follow = 0", &["follow", "seconds above 0"]);
+    refused(&[dir.path().join("a.nc")], "follow = 5\nmetric = \"index\"", &["follow", "index metric"]);
     refused(&[dir.path().join("a.nc")], "follow = 5\nsteady = true", &["follow", "steady"]);
 }

@@ -43,6 +43,11 @@ fn height(pressure: f64) -> f64 {
 }
 
 fn write(path: &Path, says: Says, vertical: &str) -> PathBuf {
+    fixture(says, vertical, &|p| p, "Pa").write(path)
+}
+
+/// A file whose pressure at the ground is written by `form` in `units`.
+fn fixture(says: Says, vertical: &str, form: &dyn Fn(f64) -> f64, units: &str) -> Fixture {
     let (levels, ny, nx) = (A.len(), LAT.len(), LON.len());
     let dims = ["time", "lev", "lat", "lon"];
     let (name, terms) = match says {
@@ -70,14 +75,14 @@ fn write(path: &Path, says: Says, vertical: &str) -> PathBuf {
         }
         Says::Sigma => file.variable("top", &[], Data::F64(vec![20.0])).with("units", "hPa"),
     };
-    let plane = (0..2 * ny * nx).map(|n| ground(n / (ny * nx), LON[n % nx])).collect();
-    file = file.variable("PS", &["time", "lat", "lon"], Data::F64(plane)).with("units", "Pa");
+    let plane = (0..2 * ny * nx).map(|n| form(ground(n / (ny * nx), LON[n % nx]))).collect();
+    file = file.variable("PS", &["time", "lat", "lon"], Data::F64(plane)).with("units", units);
     let at = |n: usize| pressure(says, n / (ny * nx) % levels, ground(n / (levels * ny * nx), LON[n % nx]));
     let all = |of: &dyn Fn(f64) -> f64| f32s((0..2 * levels * ny * nx).map(|n| of(at(n))).collect());
     file = file.variable("U", &dims, all(&|p| height(p) / 1000.0)).with("units", "m/s");
     file = file.variable("V", &dims, all(&|_| 2.0)).with("units", "m/s");
     let rising: &dyn Fn(f64) -> f64 = if vertical == "Pa/s" { &|p| -ASCENT * p / 7000.0 } else { &|_| ASCENT };
-    file.variable("OMEGA", &dims, all(rising)).with("units", vertical).write(path)
+    file.variable("OMEGA", &dims, all(rising)).with("units", vertical)
 }
 
 /// Checks all known nodes at a time; their share, and that of nodes above the ground.
@@ -135,6 +140,71 @@ fn winds_come_from_their_true_height() {
     }
 }
 
+/// The level of the file, the levels as cells, and what is no pressure at the ground.
+#[test]
+fn what_is_no_height_is_refused_or_read_as_before() {
+    let dir = tempdir().unwrap();
+    let file = write(&dir.path().join("whole.nc"), Says::Shares, "Pa/s");
+    refused(&[&file], "level = 0.85", &["level", "follows the ground", "archive.select.lev=3", "metric=index"]);
+    let picked = open_with(&[&file], "select = { lev = 3 }");
+    assert_eq!(picked.grid().axes.len(), 2);
+    let cells = open_with(&[&file], "metric = \"index\"\nw = \"none\"");
+    assert!(!notes(&cells).contains("follows the ground") && cells.grid().axes[2].len() == A.len(), "{}", notes(&cells));
+    let logarithm = fixture(Says::Shares, "Pa/s", &|p| p.ln(), "1");
+    refused(&[logarithm.write(&dir.path().join("lnsp.nc"))], "", &["PS", "its mean is", "200 to 1500 hPa"]);
+    let hectopascals = fixture(Says::Pressures, "m/s", &|p| p / 100.0, "hPa");
+    let mut archive = open(&[hectopascals.write(&dir.path().join("hpa.nc"))]);
+    let [known, above] = shares(&mut archive, 1);
+    assert!((known - above).abs() < 1e-9, "{known} {above}");
+    // Part of it, and vertical metres that count more.
+    let mut part = open_with(&[&file], "region = [11, 14, 41, 43]\nvertical_scale = 10.0");
+    assert_eq!([part.grid().axes[0].first(), part.grid().axes[0].last(), part.grid().axes[1].first()], [11.0, 14.0, 41.0]);
+    let snapshot = part.read(0).unwrap();
+    let rising = snapshot.nodes.iter().filter(|node| !node[3].is_nan()).map(|node| f64::from(node[3]));
+    assert!(rising.map(|w| (w / (10.0 * ASCENT) - 1.0).abs()).fold(0.0, f64::max) < 1e-2);
+}
+
+/// Half levels end where there is no air.
+#[test]
+fn vertical_motion_on_half_levels() {
+    let dir = tempdir().unwrap();
+    let mut file = fixture(Says::Pressures, "Pa/s", &|p| p, "Pa").dimension("ilev", A.len() + 1);
+    file.variables.retain(|variable| variable.name != "OMEGA");
+    let half = |k: usize, of: &[f64; 5], ends: [f64; 2]| match k {
+        0 => ends[0],
+        5 => ends[1],
+        k => 0.5 * (of[k - 1] + of[k]),
+    };
+    let (a, b): (Vec<f64>, Vec<f64>) = (0..6).map(|k| (1e5 * half(k, &A, [0.0, 0.0]), half(k, &B, [0.0, 1.0]))).unzip();
+    let (ny, nx) = (LAT.len(), LON.len());
+    let values = (0..2 * 6 * ny * nx)
+        .map(|n| {
+            let (k, pressure) = (n / (ny * nx) % 6, ground(n / (6 * ny * nx), LON[n % nx]));
+            -ASCENT * (a[k] + b[k] * pressure) / 7000.0
+        })
+        .collect();
+    let file = file
+        .axis("ilev", "1", &b)
+        .with("standard_name", "atmosphere_hybrid_sigma_pressure_coordinate")
+        .with("formula_terms", "ap: api b: bi ps: PS")
+        .variable("api", &["ilev"], Data::F64(a))
+        .with("units", "Pa")
+        .variable("bi", &["ilev"], Data::F64(b))
+        .variable("OMEGA", &["time", "ilev", "lat", "lon"], f32s(values))
+        .with("units", "Pa/s");
+    let mut archive = open(&[file.write(&dir.path().join("half.nc"))]);
+    let snapshot = archive.read(0).unwrap();
+    let known: Vec<f64> = snapshot.nodes.iter().filter(|node| !node[3].is_nan()).map(|node| f64::from(node[3])).collect();
+    assert!(known.len() * 5 > snapshot.nodes.len() * 4, "{} of {}", known.len(), snapshot.nodes.len());
+    // In the highest layer the ascent falls to that of no air.
+    let exact = known.iter().filter(|w| (**w - ASCENT).abs() < 1e-6).count();
+    assert!(
+        exact * 4 > known.len() * 3 && known.iter().all(|w| (0.9..1.001).contains(&(w / ASCENT))),
+        "{exact} of {}: {known:?}",
+        known.len()
+    );
+}
+
 #[test]
 fn levels_without_the_pressure_at_the_ground_say_what_is_missing() {
     let dir = tempdir().unwrap();
@@ -154,5 +224,5 @@ fn levels_without_the_pressure_at_the_ground_say_what_is_missing() {
         .with("units", "m/s")
         .write(&dir.path().join("bare.nc"));
     let archive = open(&[&bare]);
-    assert!(notes(&archive).contains("the pressure there, `PS`, is not in the files"), "{}", notes(&archive));
+    assert!(notes(&archive).contains("the pressure there, `PS`, is not in the file"), "{}", notes(&archive));
 }

@@ -14,8 +14,8 @@ use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::georeference::Georeference;
 use crate::grids::{
-    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, VelocityScale, ZERO, difference,
-    holds_mask, plan, read_component, read_levels, slab_of,
+    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, Role, VelocityScale, ZERO,
+    difference, holds_mask, plan, read_component, read_levels, slab_of,
 };
 use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -177,6 +177,10 @@ impl Archive {
             Metric::Sphere | Metric::Cartesian => seconds.clone(),
         };
         check_fit(settings, &layout, format)?;
+        if settings.follow.is_some() && layout.metric == Metric::Index {
+            let accepted = "in metres and seconds: velocities in cells an interval depend on the times that come next";
+            return Err(SourceError::setting("follow", "given in the index metric", accepted));
+        }
         let first = settings.follow.map(|_| Box::new(layout.clone()));
         let on_sphere = layout.axes[0].kind == Kind::Longitude && layout.axes[1].kind == Kind::Latitude;
         let scale = match (layout.metric, settings.velocity_unit) {
@@ -353,11 +357,6 @@ impl Archive {
         &self.seconds
     }
 
-    /// True if snapshots are counted from 0, instead of having times in seconds.
-    pub(super) fn is_counted(&self) -> bool {
-        self.metric == Metric::Index
-    }
-
     /// Metric in force.
     pub fn metric(&self) -> Metric {
         self.metric
@@ -425,7 +424,13 @@ impl Archive {
                 };
                 for component in frames.iter().flatten() {
                     let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
-                    if shape.ok().as_ref() != Some(&component.shape) {
+                    // More times may have come to a file that is followed.
+                    let grown = |(k, (now, then)): (usize, (&usize, &usize))| {
+                        now == then || (self.followed.is_some() && component.roles[k] == Role::Time && now > then)
+                    };
+                    let fits =
+                        |now: &Vec<usize>| now.len() == component.shape.len() && now.iter().zip(&component.shape).enumerate().all(grown);
+                    if !shape.ok().as_ref().is_some_and(fits) {
                         return Err(file.listing.read_error(&component.name, "it changed since the archive was opened").into());
                     }
                 }

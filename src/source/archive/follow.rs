@@ -12,6 +12,9 @@ use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+/// Looks after which a file that changes at each of them is told.
+const RESTLESS: u32 = 60;
+
 /// Length of a file and time of its last change.
 type Stamp = (u64, Option<SystemTime>);
 
@@ -22,10 +25,12 @@ pub(super) struct Followed {
     /// Layout of the first file.
     first: Layout,
     /// As the files were when they were read, or refused.
-    known: HashMap<PathBuf, Stamp>,
-    /// As changed files were when they were looked at last.
-    seen: HashMap<PathBuf, Stamp>,
-    told: HashSet<String>,
+    as_read: HashMap<PathBuf, Stamp>,
+    /// As changed files were at the last look, and how many looks in a row they have changed.
+    last_look: HashMap<PathBuf, (Stamp, u32)>,
+    /// Files that had settled when groups were made last.
+    grouped: HashSet<PathBuf>,
+    warned: HashSet<String>,
 }
 
 fn stamp(path: &Path) -> Option<Stamp> {
@@ -45,34 +50,49 @@ impl Followed {
         Ok(files.iter().filter_map(|path| Some((path.clone(), stamp(path)?))).collect())
     }
 
-    pub(super) fn new(paths: Vec<PathBuf>, settings: &ArchiveSettings, first: Layout, known: HashMap<PathBuf, Stamp>) -> Self {
-        Self { paths, settings: settings.clone(), first, known, seen: HashMap::new(), told: HashSet::new() }
+    pub(super) fn new(paths: Vec<PathBuf>, settings: &ArchiveSettings, first: Layout, as_read: HashMap<PathBuf, Stamp>) -> Self {
+        let settings = settings.clone();
+        Self { paths, settings, first, as_read, last_look: HashMap::new(), grouped: HashSet::new(), warned: HashSet::new() }
     }
 
     /// Files that are new or have changed, and have been as they are since the last look: no one writes to them.
-    fn settled(&mut self, files: &[PathBuf]) -> HashSet<PathBuf> {
+    fn settled(&mut self, files: &[PathBuf], news: &mut News) -> HashSet<PathBuf> {
         let mut settled = HashSet::new();
         for path in files {
-            let Some(now) = stamp(path).filter(|now| self.known.get(path) != Some(now)) else { continue };
-            if self.seen.insert(path.clone(), now) == Some(now) {
-                settled.insert(path.clone());
+            let Some(now) = stamp(path).filter(|now| self.as_read.get(path) != Some(now)) else { continue };
+            if is_url(path) || is_store(path) {
+                self.warn(news, format!("{}: a Zarr store is not followed, and not read", path.display()));
+                continue;
+            }
+            let changes = match self.last_look.get(path) {
+                Some((last, _)) if *last == now => {
+                    settled.insert(path.clone());
+                    continue;
+                }
+                Some((_, changes)) => changes + 1,
+                None => 1,
+            };
+            self.last_look.insert(path.clone(), (now, changes));
+            if changes == RESTLESS {
+                self.warn(news, format!("{}: it is written to all the time, and read once it rests for a second", path.display()));
             }
         }
         settled
     }
 
-    /// Files that were read or refused are looked at again only after they have changed.
-    fn done(&mut self, group: &Group) {
+    /// These are looked at again only after they have changed.
+    fn mark_read(&mut self, group: &Group) {
         for path in group {
-            if let Some(stamp) = self.seen.remove(path) {
-                self.known.insert(path.clone(), stamp);
+            if let Some((stamp, _)) = self.last_look.remove(path) {
+                self.as_read.insert(path.clone(), stamp);
             }
         }
     }
 
     /// Tells what has not been told before.
-    fn tell(&mut self, news: &mut News, what: String) {
-        if self.told.insert(what.clone()) {
+    fn warn(&mut self, news: &mut News, what: String) {
+        if self.warned.insert(what.clone()) {
+            tracing::warn!("{what}");
             news.warnings.push(what);
         }
     }
@@ -84,53 +104,65 @@ impl Archive {
     pub(super) fn look_for_news(&mut self) -> News {
         let mut news = News::default();
         let Some(mut followed) = self.followed.take() else { return news };
+        // An open file shows what it held when it was opened, and may keep others from writing to it.
+        self.open = None;
         let before = self.times.len();
-        // A folder that cannot be listed now may be at the next look.
-        if let Ok(files) = expand(&followed.paths) {
-            let settled = followed.settled(&files);
-            if !settled.is_empty() {
-                for group in self.changed_groups(&files, &settled, &mut followed, &mut news) {
-                    match self.take(&group, &followed) {
-                        Ok(0) => {}
-                        Ok(late) => {
-                            let name = group[0].display();
-                            followed.tell(
-                                &mut news,
-                                format!("{name}: {late} of its times lie before the newest that was read: they are left out"),
-                            );
-                        }
-                        Err(error) => followed.tell(&mut news, format!("not read, until it changes: {error}")),
-                    }
-                    followed.done(&group);
-                }
-            }
+        match expand(&followed.paths) {
+            Ok(files) => self.take_settled(&files, &mut followed, &mut news),
+            Err(error) => followed.warn(&mut news, format!("the files cannot be listed now: {error}")),
         }
         news.times = self.times[before..].to_vec();
         self.followed = Some(followed);
         news
     }
 
+    fn take_settled(&mut self, files: &[PathBuf], followed: &mut Followed, news: &mut News) {
+        let settled = followed.settled(files, news);
+        if settled.is_empty() || settled == followed.grouped {
+            return;
+        }
+        let mut planned = Vec::new();
+        for group in self.changed_groups(files, &settled, followed, news) {
+            match self.plan_group(&group, followed) {
+                Ok(layout) => planned.push((group.clone(), layout)),
+                Err(error) => followed.warn(news, format!("not read, until it changes: {error}")),
+            }
+            followed.mark_read(&group);
+        }
+        // What waits for a partner is not grouped again until something changes.
+        followed.grouped = settled.into_iter().filter(|path| followed.last_look.contains_key(path)).collect();
+        for (path, late) in self.append(planned) {
+            followed.warn(news, format!("{}: {late} of its times lie before the newest that was read: they are left out", path.display()));
+        }
+    }
+
     /// Groups of files of which one has settled and none is being written.
     fn changed_groups(&self, files: &[PathBuf], settled: &HashSet<PathBuf>, followed: &mut Followed, news: &mut News) -> Vec<Group> {
+        let quiet = |path: &PathBuf, followed: &Followed| settled.contains(path) || !followed.last_look.contains_key(path);
         let all = if self.files.iter().any(|file| file.group.len() > 1) {
-            match grouped(files, &followed.settings) {
+            // What is being written may be no file yet.
+            let quiet: Vec<PathBuf> = files.iter().filter(|path| quiet(path, followed)).cloned().collect();
+            match grouped(&quiet, &followed.settings) {
                 Ok(Some(groups)) => groups,
-                Ok(None) => Vec::new(),
+                Ok(None) => {
+                    let names: Vec<String> = settled.iter().map(|path| path.display().to_string()).collect();
+                    followed.warn(news, format!("not read yet: among {} is a file that is not understood", names.join(", ")));
+                    Vec::new()
+                }
                 // A partner may come later.
                 Err(error) => {
-                    followed.tell(news, format!("not read yet: {error}"));
+                    followed.warn(news, format!("not read yet: {error}"));
                     Vec::new()
                 }
             }
         } else {
             files.iter().map(|path| vec![path.clone()]).collect()
         };
-        let quiet = |path: &PathBuf| settled.contains(path) || !followed.seen.contains_key(path);
-        all.into_iter().filter(|group| group.iter().any(|path| settled.contains(path)) && group.iter().all(quiet)).collect()
+        let changed = |group: &Group| group.iter().any(|path| settled.contains(path)) && group.iter().all(|path| quiet(path, followed));
+        all.into_iter().filter(changed).collect()
     }
 
-    /// Takes the snapshots of a group of files behind the newest one. Returns how many of a new group lie before it.
-    fn take(&mut self, group: &Group, followed: &Followed) -> Result<usize, SourceError> {
+    fn plan_group(&self, group: &Group, followed: &Followed) -> Result<Layout, SourceError> {
         let (_, mut layout) = open_next(group, &followed.settings, Some(&followed.first), None, self.limits)?;
         if let Some(what) = difference(&followed.first, &layout) {
             return Err(SourceError::Mixed { first: self.files[0].path.clone(), second: group[0].clone(), what });
@@ -138,29 +170,41 @@ impl Archive {
         for (component, known) in layout.frames.iter_mut().flat_map(|frame| frame.iter_mut().zip(&self.files[0].frames[0])) {
             give_mask(component, known);
         }
-        let own = self.files.iter().position(|file| file.group.first() == group.first());
-        let file = own.unwrap_or(self.files.len());
+        Ok(layout)
+    }
+
+    /// Appends the snapshots behind the newest one, in order of time. Returns the new files of which some lie before it, and how many.
+    fn append(&mut self, planned: Vec<(Group, Layout)>) -> Vec<(PathBuf, usize)> {
         let newest = self.seconds.last().copied().unwrap_or(f64::NEG_INFINITY);
-        let mut entries: Vec<(f64, Place)> = (layout.time.seconds.iter().copied())
-            .zip(layout.time.places.iter().map(|&(frame, entry)| Place { file, frame, entry }))
-            .collect();
-        let read = self.places.iter().filter(|place| Some(place.file) == own).count();
-        entries.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let late = entries.iter().filter(|(seconds, _)| *seconds <= newest).count();
-        entries.retain(|(seconds, _)| *seconds > newest);
-        let plan = ArchiveFile { path: group[0].clone(), group: group.clone(), frames: layout.frames };
-        match own {
-            Some(own) => self.files[own] = plan,
-            None => self.files.push(plan),
+        let (mut entries, mut late): (Vec<(f64, Place)>, Vec<_>) = (Vec::new(), Vec::new());
+        for (group, layout) in planned {
+            let own = self.files.iter().position(|file| file.group.first() == group.first());
+            let file = own.unwrap_or(self.files.len());
+            let read = self.places.iter().filter(|place| Some(place.file) == own).count();
+            let places = layout.time.places.iter().map(|&(frame, entry)| Place { file, frame, entry });
+            let (old, new): (Vec<_>, Vec<_>) = layout.time.seconds.iter().copied().zip(places).partition(|(seconds, _)| *seconds <= newest);
+            if old.len() > read {
+                late.push((group[0].clone(), old.len() - read));
+            }
+            entries.extend(new);
+            let plan = ArchiveFile { path: group[0].clone(), group, frames: layout.frames };
+            match own {
+                Some(own) => self.files[own] = plan,
+                None => self.files.push(plan),
+            }
         }
-        // What is open may be the file as it was.
-        self.open = None;
+        entries.sort_by(|a, b| a.0.total_cmp(&b.0));
         for (seconds, place) in entries {
-            self.times.push(if self.is_counted() { self.times.len() as f64 } else { seconds });
+            // Two files of one time.
+            if self.seconds.last().is_some_and(|last| *last >= seconds) {
+                late.push((self.files[place.file].path.clone(), 1));
+                continue;
+            }
+            self.times.push(seconds);
             self.seconds.push(seconds);
             self.places.push(place);
         }
-        Ok(late.saturating_sub(read))
+        late
     }
 }
 

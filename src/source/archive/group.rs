@@ -135,7 +135,8 @@ fn check_coordinates(a: &DataFile, b: &DataFile) -> Result<(), SourceError> {
         }
         let (one, other) = (a.read_all(i)?, b.read_all(j)?);
         // A mesh may count heights, and the fields on it depths.
-        let same = |x: f64, y: f64| x == y || (x.is_nan() && y.is_nan()) || (kind == Kind::Level && x == -y);
+        let sign = if kind == Kind::Level && one.iter().zip(&other).all(|(x, y)| *x == -y) { -1.0 } else { 1.0 };
+        let same = |x: f64, y: f64| x == sign * y || (x.is_nan() && y.is_nan());
         if let Some(k) = one.iter().zip(&other).position(|(x, y)| !same(*x, *y)) {
             let what = format!(
                 "entry {k} of `{}` is {} and {}; components in files of their own lie on one grid",

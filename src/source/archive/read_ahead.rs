@@ -35,6 +35,8 @@ struct Shared {
     count: AtomicUsize,
     /// True while further ones may come.
     is_followed: AtomicBool,
+    /// True once the thread has ended, or panicked.
+    has_ended: AtomicBool,
     /// True once nobody reads any more.
     is_dropped: AtomicBool,
     /// What the looks found since it was asked for.
@@ -72,6 +74,7 @@ fn start(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usi
     let own = shared.clone();
     let count = range.len();
     let work = move || {
+        let _ended = Ended(own.clone());
         loop {
             for index in range.clone() {
                 let begin = Instant::now();
@@ -99,6 +102,15 @@ fn start(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usi
         what: format!("it could not start: {e}"),
     });
     ReadAhead { receiver, returned: 0, waited: Duration::ZERO, shared, failed, ended: false }
+}
+
+/// Says that the thread ends, in a panic too.
+struct Ended(Arc<Shared>);
+
+impl Drop for Ended {
+    fn drop(&mut self) {
+        self.0.has_ended.store(true, Ordering::Release);
+    }
 }
 
 impl Shared {
@@ -189,6 +201,11 @@ impl ReadAhead {
     /// True while snapshots may come that are not known yet.
     pub fn is_followed(&self) -> bool {
         !self.ended && self.shared.is_followed.load(Ordering::Acquire)
+    }
+
+    /// True while this many snapshots are neither known nor known not to come.
+    pub fn is_waiting_for(&self, count: usize) -> bool {
+        self.is_followed() && !self.shared.has_ended.load(Ordering::Acquire) && self.remaining() < count
     }
 
     /// What has come since this was asked last.

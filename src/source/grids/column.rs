@@ -16,6 +16,9 @@ use super::levels::{REFERENCE_PRESSURE, height_of, pressure_at, upward};
 use crate::error::SourceError;
 use crate::formats::DataFile;
 
+/// Lowest pressure that has a height (113 km), Pa.
+const TOP: f64 = 0.01;
+
 /// How heights follow from the two numbers of a level: s and C(s), or a (Pa) and b.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Formula {
@@ -33,7 +36,11 @@ impl Formula {
             Self::S => surface * (1.0 + s) + linear,
             Self::G1 => linear + surface * (1.0 + linear / ground),
             Self::G2 => surface + (surface + ground) * (critical * s + ground * stretching) / (critical + ground),
-            Self::Hybrid => height_of(s + stretching * ground),
+            Self::Hybrid => {
+                let pressure = s + stretching * ground;
+                // Half levels end at a pressure of 0.
+                height_of(if pressure < TOP { TOP } else { pressure })
+            }
         }
     }
 

@@ -2,11 +2,12 @@
 
 use super::axes::{AxisPlan, Quantity};
 use super::column::{Columns, Formula};
-use super::component::{ComponentPlan, Role};
+use super::component::{ComponentPlan, Role, read_component};
 use super::dimensions::Extent;
 use super::layout::Layout;
 use super::levels::REFERENCE_PRESSURE;
 use super::planner::Planner;
+use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::units::Unit;
 use crate::cf::velocity::{Candidate, Velocity};
@@ -23,6 +24,8 @@ pub struct Terrain {
     formula: Formula,
 }
 
+/// Mean pressures at the ground that are taken as such, Pa.
+const PRESSURES: [f64; 2] = [2e4, 1.5e5];
 /// Names of ROMS and CROCO, for levels of tracers and those between them: s, C(s).
 const NAMES: [[&[&str]; 2]; 2] = [[&["s_rho", "sc_r"], &["Cs_r", "Cs_rho"]], [&["s_w", "sc_w"], &["Cs_w"]]];
 
@@ -63,18 +66,25 @@ impl Planner<'_> {
         let mut found = vec![Some((dimension, columns))];
         let v = self.columns(velocity.v.variable, time)?;
         if v.is_none() {
-            return Err(self.misfit(velocity.v.variable, "it has no levels that follow the bottom, which u has"));
+            return Err(self.misfit(velocity.v.variable, "it has no levels that follow the bottom or the ground, which u has"));
         }
         found.push(v);
         found.push(match &velocity.w {
             Some(w) => {
-                let is_tendency = Unit::parse(self.settings.unit("w").or(self.variable(w.variable).units()).unwrap_or_default())
-                    .is_some_and(|unit| unit.is_pressure_tendency());
+                let variable = self.variable(w.variable);
+                let unit = Unit::parse(self.settings.unit("w").or(variable.units()).unwrap_or_default());
+                // Without a unit, names tell.
+                let named = variable.text("standard_name") == Some("lagrangian_tendency_of_air_pressure")
+                    || ["omega", "wap"].contains(&variable.name.to_ascii_lowercase().as_str());
+                let is_tendency = unit.is_some_and(|u| u.is_pressure_tendency() || (u.is_dimensionless() && named));
                 self.columns(w.variable, time)?.map(|(dimension, columns)| (dimension, Columns { is_tendency, ..columns }))
             }
             None => None,
         });
         let Some((_, columns)) = &found[0] else { return Ok(None) };
+        if columns.formula.is_of_air() {
+            self.check_is_height(dimension)?;
+        }
         let heights = self.heights_for(columns, first)?;
         let level = &self.listing().dimensions[dimension].name;
         let to = match heights[..] {
@@ -106,6 +116,18 @@ impl Planner<'_> {
         ));
         let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
         Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, formula }))
+    }
+
+    /// Refuses a `level` that is one of the levels, where a height is wanted.
+    fn check_is_height(&self, dimension: usize) -> Result<(), SourceError> {
+        let (Some(level), Some(coordinate)) = (self.settings.level, self.measured(dimension).coordinate) else { return Ok(()) };
+        let Some(entry) = self.coordinate_values(coordinate)?.iter().position(|value| *value == level) else { return Ok(()) };
+        let name = &self.listing().dimensions[dimension].name;
+        let accepted = format!(
+            "heights in metres, since `{name}` follows the ground; --set archive.select.{name}={entry} reads this level as it is, \
+             --set archive.metric=index all of them"
+        );
+        Err(SourceError::setting("level", level.to_string(), accepted))
     }
 
     fn heights_for(&self, columns: &Columns, first: Option<&Layout>) -> Result<Vec<f64>, SourceError> {
@@ -159,7 +181,7 @@ impl Planner<'_> {
             () if self.settings.w.is_none() && !terrain.is_of_air() && name.eq_ignore_ascii_case("omega") => {
                 "is the velocity through the levels"
             }
-            () if terrain.columns(2).is_none() => "does not lie on levels that follow the bottom",
+            () if terrain.columns(2).is_none() => "does not lie on levels that follow the bottom or the ground",
             () => return Some(w),
         };
         self.note(format!("`{name}` {odd}, and is not used"));
@@ -183,7 +205,10 @@ impl Planner<'_> {
         let dims = &self.variable(variable).dimensions;
         let Some((&[y, x], others)) = dims.split_last_chunk::<2>().map(|(rest, plane)| (plane, rest)) else { return Ok(None) };
         let listing = self.listing();
-        for &dimension in others.iter().filter(|&&d| listing.dimensions[d].len > 1 && Some(d) != time) {
+        let picked = |d: usize| self.settings.entry(&listing.dimensions[d].name).is_some();
+        for dimension in
+            others.iter().copied().filter(|&d| listing.dimensions[d].len > 1 && Some(d) != time && !picked(d)).collect::<Vec<_>>()
+        {
             let coordinates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
             let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
             let found = match declared {
@@ -200,10 +225,29 @@ impl Planner<'_> {
             let ground = self.plane_field(ground, plane, time, variable)?;
             let surface = surface.map(|index| self.plane_field(index, plane, time, variable)).transpose()?;
             let levels = order.iter().map(|&k| levels[k]).collect();
+            if formula.is_of_air() {
+                self.check_pressures(&ground)?;
+            }
             let columns = Columns { formula, levels, order, critical_depth, ground, surface, is_tendency: false, heights: Vec::new() };
             return Ok(Some((dimension, columns)));
         }
         Ok(None)
+    }
+
+    /// Refuses a field that is no pressure at the ground, such as its logarithm.
+    fn check_pressures(&self, ground: &ComponentPlan) -> Result<(), SourceError> {
+        let mut found = read_component(self.file, ground, &ground.file_order(), 0)?;
+        found.retain(|pressure| pressure.is_finite());
+        let mean = found.iter().map(|&pressure| f64::from(pressure)).sum::<f64>() / found.len() as f64;
+        if (PRESSURES[0]..=PRESSURES[1]).contains(&mean) {
+            return Ok(());
+        }
+        let what = format!(
+            "its mean is {mean:.4e} Pa; accepted is a pressure at the ground of {:.0} to {:.0} hPa, in Pa if it has no unit",
+            PRESSURES[0] / 100.0,
+            PRESSURES[1] / 100.0
+        );
+        Err(SourceError::variable(self.path(), &ground.name, what))
     }
 
     /// Terms that `formula_terms` of the coordinate `level` names.
@@ -219,17 +263,24 @@ impl Planner<'_> {
         let listing = self.listing();
         let find = |term: &str, usual: &str| listing.find(name_of(term).unwrap_or(usual));
         if declared.is_of_air() {
+            // Cells are those of the file.
+            if self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells {
+                return Ok(None);
+            }
             let Some(ground) = find("ps", "ps") else {
                 let (name, ground) = (&coordinate.name, name_of("ps").unwrap_or("ps"));
                 self.note(format!(
-                    "`{name}` follows the ground, but the pressure there, `{ground}`, is not in the files: name the file that holds it too, to read fixed heights"
+                    "`{name}` follows the ground, but the pressure there, `{ground}`, is not in the file, which fixed heights need: merge it into the file"
                 ));
                 return Ok(None);
             };
             let levels = self.pressures(declared, level, dimension, &name_of)?;
             let Some(levels) = levels else {
-                let what = format!("its levels `{}` lack a term of their formula (`formula_terms`)", coordinate.name);
-                return Err(self.misfit(variable, what));
+                let name = &coordinate.name;
+                self.note(format!(
+                    "`{name}` follows the ground, but a term of its formula (`formula_terms`) is not in the file: it is not read as heights"
+                ));
+                return Ok(None);
             };
             return Ok(Some(Terms { formula: Formula::Hybrid, levels, critical_depth: 0.0, ground, surface: None }));
         }
@@ -302,7 +353,10 @@ impl Planner<'_> {
             // Without p0, the one of most models.
             None => {
                 let reference = number("p0")?.map_or(REFERENCE_PRESSURE, |p| p * pascals(named("p0")));
-                row("a")?.map(|a| a.into_iter().map(|a| a * reference).collect())
+                // Some models write `a` as a pressure.
+                let unit = named("a").and_then(|index| Unit::parse(self.variable(index).units()?)).filter(Unit::is_pressure);
+                let factor = unit.map_or(reference, |unit| unit.factor);
+                row("a")?.map(|a| a.into_iter().map(|a| a * factor).collect())
             }
         };
         Ok(fixed.zip(share).map(|(fixed, share)| fixed.into_iter().zip(share).map(|(a, b)| [a, b]).collect()))

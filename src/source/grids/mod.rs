@@ -36,7 +36,7 @@ mod unstructured_plan;
 mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
-pub use component::{ComponentPlan, Orders, read_component, read_levels};
+pub use component::{ComponentPlan, Orders, Role, read_component, read_levels};
 pub use content::{Content, content};
 pub use land::Mask;
 pub use layout::{Layout, Resampling, difference};

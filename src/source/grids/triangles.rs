@@ -208,7 +208,11 @@ fn keep_near_side(points: &[Vector], triangles: &mut Vec<[u32; 3]>) {
         let normal = cross(between(a, b), between(a, c));
         points.iter().map(|&p| dot(between(a, p), normal)).filter(|d| d.is_finite()).sum::<f64>()
     };
-    let turn = triangles.iter().take(MOST_ASKED).map(above).fold(0.0, |most: f64, sum| if sum.abs() > most.abs() { sum } else { most });
+    let turn = triangles
+        .iter()
+        .step_by(triangles.len() / MOST_ASKED + 1)
+        .map(above)
+        .fold(0.0, |most: f64, sum| if sum.abs() > most.abs() { sum } else { most });
     triangles.retain(|triangle| {
         let [a, b, c] = triangle.map(|n| points[n as usize]);
         dot(a, cross(b, c)) * turn < 0.0

@@ -197,7 +197,7 @@ impl Planner<'_> {
         let known = |v: &&f64| v.is_finite() && **v >= 0.0;
         let (least, greatest) = values.iter().filter(known).fold((f64::INFINITY, 0.0f64), |(a, b), &v| (a.min(v), b.max(v)));
         // Models count from 1, unless a 0 is there which does not only fill up faces of fewer corners.
-        let is_full = || pairs(listing).iter().any(|(d, _)| listing.dimensions[*d].len as f64 == greatest);
+        let is_full = || pairs(listing).iter().any(|(d, _)| *d != of.faces && listing.dimensions[*d].len as f64 == greatest);
         let stated = variable.numbers("start_index").first().copied();
         let start = stated.unwrap_or_else(|| if least == 0.0 && !is_full() { 0.0 } else { 1.0 });
         let node = |v: f64| {
