@@ -89,7 +89,7 @@ fn records_that_are_appended_are_read() {
     let path = dir.path().join("grows.nc");
     let write = |day: usize, file: &mut netcdf::FileMut| {
         let value = |name: &str| if name == "u" { day as f32 } else { 0.5 };
-        file.variable_mut("time").unwrap().put_values(&[day as f64], [day - 1..day]).unwrap();
+        file.variable_mut("time").unwrap().put_values(&[day as f64], day - 1..day).unwrap();
         for name in ["u", "v"] {
             file.variable_mut(name).unwrap().put_values(&[value(name); 12], (day - 1..day, 0..3, 0..4)).unwrap();
         }
