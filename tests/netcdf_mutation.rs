@@ -26,7 +26,7 @@ fn triangles(format: Format) -> Fixture {
     let faces = corners.len() / 3;
     let wave = |n: usize| (n as f64 * 0.1).sin();
     // A flow that a coarse grid carries.
-    let along_x = |face: usize| (face / 2 % (NODES - 1)) as f64;
+    let along_x = |face: usize| (face / 2 % (NODES - 1)) as f64 + [2.0, 1.0][face % 2] / 3.0;
     let places = |k: usize| (0..NODES * NODES).map(|n| [n % NODES, n / NODES][k] as f64 + 0.1 * wave(7 * n)).collect();
     Fixture::new(format, &[("time", 2), ("face", faces), ("node", NODES * NODES), ("three", 3)])
         .axis("time", "hours since 2000-01-01", &[0.0, 1.0])
