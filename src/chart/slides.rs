@@ -27,8 +27,6 @@ impl FirstSlides {
         // The method plays no part, and `auto` is none.
         let mut settings = with_method(settings, Method::Reference, Kind::Table);
         settings.time.slides = Some(count);
-        // What is there suffices.
-        settings.archive.follow = None;
         let mut setup = Setup::new(settings)?;
         let first = setup.slides.next_slide(stop)?.ok_or(RunError::EndedEarly)?;
         let per_slide = match &first.velocity {
@@ -83,8 +81,7 @@ impl FirstSlides {
     ///
     /// # Errors
     /// A setting is not accepted, or the source cannot be opened.
-    pub(super) fn setup(&self, mut settings: Settings, from: usize) -> Result<Setup, RunError> {
-        settings.archive.follow = None;
+    pub(super) fn setup(&self, settings: Settings, from: usize) -> Result<Setup, RunError> {
         let mut setup = Setup::new(settings)?;
         setup.slides = Box::new(Again(self.slides[from..].iter().cloned().collect()));
         Ok(setup)

@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{Decision, RunError, Setup, why_steps};
+use ridgewatch::run::{Decision, RunError, Settings, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -104,15 +104,15 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
     if scene.render.method != Method::Auto {
         return Ok(None);
     }
-    if scene.render.until.is_some() || scene.render.budget.is_some() {
+    let untried = if scene.render.until.is_some() || scene.render.budget.is_some() {
+        Some("only smooth methods have render.until and render.budget")
+    } else if scene.archive.follow.is_some() {
+        Some("an archive that is followed may have no window yet to try methods on")
+    } else {
+        None
+    };
+    if let Some(why) = untried {
         scene.render.method = Method::TwoLevel;
-        let why = "only smooth methods have render.until and render.budget";
-        messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
-        return Ok(Some(Decision::new("render.method", "two_level", why)));
-    }
-    if scene.archive.follow.is_some() {
-        scene.render.method = Method::TwoLevel;
-        let why = "an archive that is followed may have no window yet to try methods on";
         messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
         return Ok(Some(Decision::new("render.method", "two_level", why)));
     }
@@ -185,8 +185,13 @@ pub fn text_with_tau(scene: &SceneFile, setup: &Setup, text: String) -> Result<S
 
 /// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
 pub fn open(scene: &SceneFile) -> Result<Setup> {
+    open_by(scene, Setup::new)
+}
+
+/// The same by [`Setup::new`] or [`Setup::following`].
+pub fn open_by(scene: &SceneFile, set_up: fn(Settings) -> Result<Setup, RunError>) -> Result<Setup> {
     let _spinner = opening(scene);
-    Setup::new(scene.settings()).map_err(|error| located(scene, error, RunError::refused))
+    set_up(scene.settings()).map_err(|error| located(scene, error, RunError::refused))
 }
 
 /// Spinner shown while a source is opened.

@@ -142,9 +142,7 @@ struct Convergence {
 
 /// Computes, compares and writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    let mut scene = scene(common, &options.paths)?;
-    // Only `replay` waits for what comes.
-    scene.archive.follow = None;
+    let scene = scene(common, &options.paths)?;
     let faulty = |error| located(&scene, error, RunError::refused);
     let Setup { plan, mut slides, notes, .. } = open(&scene)?;
     notes.iter().for_each(messages::note);

@@ -73,7 +73,6 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     scene.render.budget = options.budget.or(scene.render.budget);
     scene.time.slides = Some(1);
     scene.time.frames_per_slide = 1;
-    scene.archive.follow = None;
     if let Some(frames) = options.warmup {
         scene.time.warmup_frames = frames;
         scene.set_by("time.warmup_frames", format!("--warmup {frames}"));

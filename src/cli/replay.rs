@@ -1,8 +1,9 @@
 //! `ridgewatch replay`.
 
-use super::common::{Common, device, open, scene, seconds, settle_method};
+use super::common::{Common, device, open_by, scene, seconds, settle_method};
 use super::session::{RunArguments, Session};
 use anyhow::Result;
+use ridgewatch::run::Setup;
 use std::path::PathBuf;
 
 /// Options of `replay`.
@@ -31,7 +32,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let method = settle_method(common, &mut scene, &options.paths, &device)?;
     let text = scene.to_toml()?;
     Session { common, options: &options.run, scene, text, follows: None }.run(|scene, _| {
-        let mut setup = open(scene)?;
+        let mut setup = open_by(scene, Setup::following)?;
         setup.decisions.extend(method);
         Ok(Some(setup))
     })

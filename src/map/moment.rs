@@ -50,8 +50,6 @@ impl Moment {
         if let Some(longest) = (0..taus.len()).max_by(|a, b| values[*a].total_cmp(&values[*b])) {
             settings.time.tau = Some(taus[longest].clone());
         }
-        // Only `replay` waits for what comes.
-        settings.archive.follow = None;
         let mut setup = Setup::new(settings.clone())?;
         let tau = setup.plan.map.tau;
         let notes = std::mem::take(&mut setup.notes);

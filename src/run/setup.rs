@@ -53,11 +53,20 @@ pub(crate) fn auto_steps(is_gridded: bool, interpolation: Interpolation) -> Step
 }
 
 impl Setup {
-    /// Opens the source and chooses the settings that the scene leaves open.
+    /// Opens the source and chooses the settings that the scene leaves open. An archive is taken as it is now.
     ///
     /// # Errors
     /// A setting is not accepted, or the source cannot be opened.
-    pub fn new(scene: Settings) -> Result<Self, RunError> {
+    pub fn new(mut scene: Settings) -> Result<Self, RunError> {
+        scene.archive.follow = None;
+        Self::following(scene)
+    }
+
+    /// The same, and an archive is followed if the scene says so: its slides may wait for snapshots that come.
+    ///
+    /// # Errors
+    /// As for [`Self::new`].
+    pub fn following(scene: Settings) -> Result<Self, RunError> {
         scene.check()?;
         let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
         Self::settle(scene, snapshots, None)

@@ -189,9 +189,9 @@ impl Slides for ArchiveSlides {
         let Self { reader, window, taken, .. } = self;
         while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
             let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
-            let arrived = reader.arrived();
-            self.dates.extend(arrived.dates);
-            warnings.extend(arrived.warnings);
+            let news = reader.news();
+            self.dates.extend(news.dates);
+            warnings.extend(news.warnings);
             let newest = window.newest();
             match window.push(snapshot?) {
                 Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
@@ -226,7 +226,7 @@ impl Slides for ArchiveSlides {
     }
 
     fn warnings(&mut self) -> Vec<String> {
-        self.reader.arrived().warnings
+        self.reader.news().warnings
     }
 
     fn is_awaited(&self) -> Option<bool> {

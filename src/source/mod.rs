@@ -23,8 +23,8 @@ mod snapshots;
 mod source_settings;
 
 pub use archive::{
-    Archive, Arrived, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead,
-    ResamplingReport, ResolutionReport, Steady, TimeReport, VariableReport, expand, follow, inspect, read_ahead, synthesize,
+    Archive, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead, ResamplingReport,
+    ResolutionReport, Steady, TimeReport, VariableReport, expand, follow, inspect, read_ahead, synthesize,
 };
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use cf::calendar::utc;

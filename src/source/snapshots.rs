@@ -100,11 +100,11 @@ pub trait SnapshotSource: Send {
     }
 }
 
-/// What a look for further snapshots found.
+/// What looks for further snapshots found.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct News {
-    /// Times of the new snapshots, ascending.
-    pub times: Vec<f64>,
+    /// Times of the new snapshots, ascending, with their dates.
+    pub dates: Vec<(f64, Option<String>)>,
     /// What was found and not taken, each said once.
     pub warnings: Vec<String>,
 }

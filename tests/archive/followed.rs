@@ -53,7 +53,7 @@ fn warnings(reader: &ReadAhead) -> Vec<String> {
     let mut found = Vec::new();
     while found.is_empty() && begin.elapsed() < LONGEST {
         std::thread::sleep(Duration::from_millis(50));
-        found.extend(reader.arrived().warnings);
+        found.extend(reader.news().warnings);
     }
     found
 }
@@ -73,7 +73,7 @@ fn names_and_turns_do_not_matter() {
         put(dir.path(), name, &fixture(&[day], &["u", "v"]));
     }
     assert_eq!(next(&mut reader, 2), [8.0, 9.0]);
-    assert_eq!(reader.arrived().warnings, Vec::<String>::new());
+    assert_eq!(reader.news().warnings, Vec::<String>::new());
     // A store that comes later.
     let store = dir.path().join("x.nc");
     std::fs::create_dir(&store).unwrap();
@@ -127,16 +127,16 @@ fn files_that_come_and_files_that_grow_are_read_on() {
     // A new file, whose first time lies before the newest.
     put(dir.path(), "b.nc", &fixture(&[1.5, 3.0, 4.0], &["u", "v"]));
     assert_eq!(next(&mut reader, 2), [3.0, 4.0]);
-    let arrived = reader.arrived();
+    let news = reader.news();
     assert_eq!(
-        arrived.dates.iter().map(|(_, date)| date.clone().unwrap()).collect::<Vec<_>>(),
+        news.dates.iter().map(|(_, date)| date.clone().unwrap()).collect::<Vec<_>>(),
         ["2000-01-04T00:00:00Z", "2000-01-05T00:00:00Z"]
     );
-    assert!(arrived.warnings[0].contains("b.nc: 1 of its times lie before the newest"), "{:?}", arrived.warnings);
+    assert!(news.warnings[0].contains("b.nc: 1 of its times lie before the newest"), "{:?}", news.warnings);
     // The same file with two more times.
     put(dir.path(), "b.nc", &fixture(&[1.5, 3.0, 4.0, 5.0, 6.0], &["u", "v"]));
     assert_eq!(next(&mut reader, 2), [5.0, 6.0]);
-    assert_eq!(reader.arrived().warnings, Vec::<String>::new());
+    assert_eq!(reader.news().warnings, Vec::<String>::new());
     // What cannot be read is told once, and read when it has changed.
     std::fs::write(dir.path().join("c.nc"), "no data yet").unwrap();
     let warnings = warnings(&reader);
@@ -149,7 +149,7 @@ fn files_that_come_and_files_that_grow_are_read_on() {
     put(dir.path(), "d.nc", &other.winds(f32s(vec![1.0; 4]), f32s(vec![1.0; 4])));
     put(dir.path(), "e.nc", &fixture(&[9.0], &["u", "v"]));
     assert_eq!(next(&mut reader, 1), [9.0]);
-    let warnings = reader.arrived().warnings;
+    let warnings = reader.news().warnings;
     assert!(warnings.len() == 1 && warnings[0].contains("d.nc") && warnings[0].contains("axes"), "{warnings:?}");
 }
 

@@ -311,7 +311,7 @@ fn levels_that_do_not_fit_say_why() {
     for (toml, pieces) in [
         ("level = 10.0", &["level", "10", "negative below the surface"][..]),
         ("level = -1000.0", &["level", "-1000", "deepest bottom"]),
-        ("heights = [-5.0]", &["heights", "two heights or more", "archive.level=HEIGHT"]),
+        ("heights = [-5.0]", &["heights", "two heights or more", "archive.level=-DEPTH"]),
         ("heights = [-5.0, -9.0]", &["strictly ascending"]),
         ("heights = [-9.0, -5.0]\nlevel = -5.0", &["heights", "beside `level`"]),
     ] {

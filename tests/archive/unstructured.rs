@@ -120,6 +120,11 @@ fn triangles(faces: &[[usize; 4]]) -> Vec<f64> {
     (0..3).flat_map(|k| all.iter().map(move |t| (t[k] + 1) as f64)).collect()
 }
 
+fn triangle_middles(nodes: &[[f64; 2]], corners: &[f64]) -> Vec<[f64; 2]> {
+    let count = corners.len() / 3;
+    (0..count).map(|t| [0, 1].map(|k| (0..3).map(|c| nodes[corners[c * count + t] as usize - 1][k]).sum::<f64>() / 3.0)).collect()
+}
+
 fn check_basin(name: &str, archive: &mut Archive, wanted: f64) {
     let snapshot = archive.read(0).unwrap();
     let (worst, known) = error(&snapshot, |depth| 1.0 + depth / 1000.0);
@@ -156,9 +161,7 @@ fn nodes_and_faces_of_a_basin_with_an_island() {
     check_basin("UGRID, faces without coordinates", &mut open(&[&file]), 2e-2);
     // FVCOM: triangles by their usual name.
     let corners = triangles(&faces);
-    let cells: Vec<[f64; 2]> = (0..corners.len() / 3)
-        .map(|t| [0, 1].map(|k| (0..3).map(|c| nodes[corners[c * corners.len() / 3 + t] as usize - 1][k]).sum::<f64>() / 3.0))
-        .collect();
+    let cells = triangle_middles(&nodes, &corners);
     let fixture = times(&[("node", nodes.len()), ("nele", cells.len()), ("three", 3)]);
     let fixture = fixture.variable("nv", &["three", "nele"], Data::F64(corners.clone()));
     let fixture = coordinates(fixture, "node", ["lon", "lat"], &nodes, false);
@@ -203,8 +206,7 @@ fn names_and_orders_of_models() {
     let (nodes, faces) = basin();
     let corners = triangles(&faces);
     let count = corners.len() / 3;
-    let middles: Vec<[f64; 2]> =
-        (0..count).map(|t| [0, 1].map(|k| (0..3).map(|c| nodes[corners[c * count + t] as usize - 1][k]).sum::<f64>() / 3.0)).collect();
+    let middles = triangle_middles(&nodes, &corners);
     let icon = coordinates(times(&[("ncells", count)]), "ncells", ["clon", "clat"], &middles, true);
     let icon = written(dir.path(), "icon.nc", velocities(icon, "ncells", &middles, &[]));
     let grid = Fixture::new(NETCDF4, &[("cell", count), ("vertex", nodes.len()), ("nv", 3)]).variable(
@@ -311,8 +313,7 @@ fn components_and_mesh_in_files_of_their_own() {
     let (nodes, faces) = basin();
     let corners = triangles(&faces);
     let count = corners.len() / 3;
-    let middles: Vec<[f64; 2]> =
-        (0..count).map(|t| [0, 1].map(|k| (0..3).map(|c| nodes[corners[c * count + t] as usize - 1][k]).sum::<f64>() / 3.0)).collect();
+    let middles = triangle_middles(&nodes, &corners);
     let mesh = Fixture::new(NETCDF4, &[("nod2", nodes.len()), ("elem", count), ("n3", 3)])
         .variable("elements", &["n3", "elem"], Data::F64(corners))
         .with("long_name", "nodes of elements");

@@ -68,10 +68,8 @@ pub struct Archive {
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
     pub(super) limits: Limits,
-    /// Layout of the first file, until `followed` takes it.
-    first: Option<Box<Layout>>,
     /// Set if further snapshots may come.
-    pub(super) followed: Option<Followed>,
+    pub(super) followed: Option<Box<Followed>>,
 }
 
 impl Archive {
@@ -86,7 +84,7 @@ impl Archive {
         let mut archive = Self::open_files(files, settings)?;
         if let Some(stamps) = stamps {
             let paths = if paths.is_empty() { settings.files.clone() } else { paths.to_vec() };
-            archive.followed = archive.first.take().map(|first| Followed::new(paths, settings, *first, stamps));
+            archive.followed = archive.followed.map(|followed| followed.watching(paths, stamps));
         }
         let synthetic = settings.synthetic.as_ref().filter(|_| paths.is_empty() && settings.files.is_empty());
         // Synthetic files of earlier versions do not declare themselves.
@@ -181,7 +179,7 @@ impl Archive {
             let accepted = "in metres and seconds: velocities in cells an interval depend on the times that come next";
             return Err(SourceError::setting("follow", "given in the index metric", accepted));
         }
-        let first = settings.follow.map(|_| Box::new(layout.clone()));
+        let followed = settings.follow.map(|_| Box::new(Followed::new(settings, layout.clone())));
         let on_sphere = layout.axes[0].kind == Kind::Longitude && layout.axes[1].kind == Kind::Latitude;
         let scale = match (layout.metric, settings.velocity_unit) {
             (Metric::Index, VelocityUnit::Si) => Some(VelocityScale::to_cells(&layout.axes)),
@@ -228,8 +226,7 @@ impl Archive {
             expected: expected.map(|listing| listing.part(&names)),
             limits,
             files,
-            first,
-            followed: None,
+            followed,
         };
         if let Some(what) = synthetic {
             archive.declare_synthetic(what);
@@ -324,17 +321,16 @@ impl Archive {
         let corners = |cell: usize| [0, 1, *nx, nx + 1].map(|corner| cell / (nx - 1) * nx + cell % (nx - 1) + corner);
         let cells = nx.saturating_sub(1) * ny.saturating_sub(1);
         // Points without rows have no cells here.
-        let (dead, of, which) = match ny {
-            1 => (zero.iter().filter(|zero| **zero).count(), zero.len(), "points"),
-            _ => ((0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count(), cells, "cells"),
+        let (dead, of, at, which) = match ny {
+            1 => (zero.iter().filter(|zero| **zero).count(), zero.len(), "", "points"),
+            _ => ((0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count(), cells, "all corners of ", "cells"),
         };
         if dead > 0 {
             let share = 100.0 * dead as f64 / of as f64;
             self.description.notes.push(format!(
-                "the velocity is exactly 0 at {}{share:.1} % of the {which}{}, at all of {} times: is this land? Particles rest \
+                "the velocity is exactly 0 at {at}{share:.1} % of the {which}{}, at all of {} times: is this land? Particles rest \
                  there; --set archive.mask=zero takes such nodes as missing, --set archive.mask=NAME names a mask, in these files or in one \
                  that is named beside them, --set archive.mask=none keeps them",
-                if which == "cells" { "all corners of " } else { "" },
                 if self.axes.len() > 2 { " of one level" } else { "" },
                 sampled(self.times.len()).len()
             ));

@@ -7,7 +7,7 @@ use crate::archive_settings::ArchiveSettings;
 use crate::error::SourceError;
 use crate::formats::{is_store, is_url};
 use crate::grids::{ComponentPlan, Layout, difference};
-use crate::snapshots::News;
+use crate::snapshots::{News, SnapshotSource};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -50,9 +50,22 @@ impl Followed {
         Ok(files.iter().filter_map(|path| Some((path.clone(), stamp(path)?))).collect())
     }
 
-    pub(super) fn new(paths: Vec<PathBuf>, settings: &ArchiveSettings, first: Layout, as_read: HashMap<PathBuf, Stamp>) -> Self {
-        let settings = settings.clone();
-        Self { paths, settings, first, as_read, last_look: HashMap::new(), grouped: HashSet::new(), warned: HashSet::new() }
+    /// Of an archive whose first file has the layout `first`.
+    pub(super) fn new(settings: &ArchiveSettings, first: Layout) -> Self {
+        Self {
+            paths: Vec::new(),
+            settings: settings.clone(),
+            first,
+            as_read: HashMap::new(),
+            last_look: HashMap::new(),
+            grouped: HashSet::new(),
+            warned: HashSet::new(),
+        }
+    }
+
+    /// Looks at these files, folders and patterns, whose files were read as they are in `as_read`.
+    pub(super) fn watching(self: Box<Self>, paths: Vec<PathBuf>, as_read: HashMap<PathBuf, Stamp>) -> Box<Self> {
+        Box::new(Self { paths, as_read, ..*self })
     }
 
     /// Files that are new or have changed, and have been as they are since the last look: no one writes to them.
@@ -111,7 +124,7 @@ impl Archive {
             Ok(files) => self.take_settled(&files, &mut followed, &mut news),
             Err(error) => followed.warn(&mut news, format!("the files cannot be listed now: {error}")),
         }
-        news.times = self.times[before..].to_vec();
+        news.dates = self.times[before..].iter().map(|&time| (time, self.date(time))).collect();
         self.followed = Some(followed);
         news
     }

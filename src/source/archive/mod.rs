@@ -19,7 +19,7 @@ pub use archive::Archive;
 pub use files::expand;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use memory::MemorySource;
-pub use read_ahead::{Arrived, DEFAULT_READ_AHEAD, ReadAhead, follow, read_ahead};
+pub use read_ahead::{DEFAULT_READ_AHEAD, ReadAhead, follow, read_ahead};
 pub use steady::Steady;
 pub use synthetic::{GlobeTurbulence, synthesize};
 

@@ -1,7 +1,7 @@
 //! The I/O thread, which reads ahead into a bounded channel, and waits for further snapshots if the source is followed.
 
 use crate::error::SourceError;
-use crate::snapshots::{Listener, SnapshotSource, StillReading};
+use crate::snapshots::{Listener, News, SnapshotSource, StillReading};
 use ridgewatch_field::Snapshot;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -17,15 +17,6 @@ const LOOK: Duration = Duration::from_secs(1);
 /// Time within which a thread that waits notices that nobody reads any more.
 const NOTICE: Duration = Duration::from_millis(50);
 
-/// Snapshots that have come, and what was found and not taken.
-#[derive(Debug, Default, PartialEq)]
-pub struct Arrived {
-    /// Times and dates.
-    pub dates: Vec<(f64, Option<String>)>,
-    /// See [`crate::News::warnings`].
-    pub warnings: Vec<String>,
-}
-
 /// What the thread and its reader share.
 #[derive(Default)]
 struct Shared {
@@ -40,7 +31,7 @@ struct Shared {
     /// True once nobody reads any more.
     is_dropped: AtomicBool,
     /// What the looks found since it was asked for.
-    arrived: Mutex<Arrived>,
+    news: Mutex<News>,
 }
 
 /// Snapshots in time order, read ahead by a thread. Dropping it ends the thread after the current read.
@@ -119,12 +110,11 @@ impl Shared {
         let begin = Instant::now();
         loop {
             let found = source.look();
-            let more = found.times.len();
-            let dates = found.times.iter().map(|&time| (time, source.date(time)));
-            let mut arrived = self.arrived.lock().unwrap_or_else(PoisonError::into_inner);
-            arrived.dates.extend(dates);
-            arrived.warnings.extend(found.warnings);
-            drop(arrived);
+            let more = found.dates.len();
+            let mut news = self.news.lock().unwrap_or_else(PoisonError::into_inner);
+            news.dates.extend(found.dates);
+            news.warnings.extend(found.warnings);
+            drop(news);
             if more > 0 {
                 self.count.fetch_add(more, Ordering::Release);
                 return Some(more);
@@ -209,8 +199,8 @@ impl ReadAhead {
     }
 
     /// What has come since this was asked last.
-    pub fn arrived(&self) -> Arrived {
-        std::mem::take(&mut *self.shared.arrived.lock().unwrap_or_else(PoisonError::into_inner))
+    pub fn news(&self) -> News {
+        std::mem::take(&mut *self.shared.news.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 

@@ -71,12 +71,7 @@ impl Planner<'_> {
         found.push(v);
         found.push(match &velocity.w {
             Some(w) => {
-                let variable = self.variable(w.variable);
-                let unit = Unit::parse(self.settings.unit("w").or(variable.units()).unwrap_or_default());
-                // Without a unit, names tell.
-                let named = variable.text("standard_name") == Some("lagrangian_tendency_of_air_pressure")
-                    || ["omega", "wap"].contains(&variable.name.to_ascii_lowercase().as_str());
-                let is_tendency = unit.is_some_and(|u| u.is_pressure_tendency() || (u.is_dimensionless() && named));
+                let is_tendency = self.is_pressure_tendency(w.variable);
                 self.columns(w.variable, time)?.map(|(dimension, columns)| (dimension, Columns { is_tendency, ..columns }))
             }
             None => None,
@@ -118,6 +113,15 @@ impl Planner<'_> {
         Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, formula }))
     }
 
+    /// True if w is the change of a particle's pressure: by its unit or, without one, by its names.
+    fn is_pressure_tendency(&self, w: usize) -> bool {
+        let variable = self.variable(w);
+        let unit = Unit::parse(self.settings.unit("w").or(variable.units()).unwrap_or_default());
+        let named = variable.text("standard_name") == Some("lagrangian_tendency_of_air_pressure")
+            || ["omega", "wap"].contains(&variable.name.to_ascii_lowercase().as_str());
+        unit.is_some_and(|u| u.is_pressure_tendency() || (u.is_dimensionless() && named))
+    }
+
     /// Refuses a `level` that is one of the levels, where a height is wanted.
     fn check_is_height(&self, dimension: usize) -> Result<(), SourceError> {
         let (Some(level), Some(coordinate)) = (self.settings.level, self.measured(dimension).coordinate) else { return Ok(()) };
@@ -150,7 +154,10 @@ impl Planner<'_> {
                 Ok(vec![level])
             }
             (None, Some(heights), None) if heights.len() < 2 => {
-                let accepted = "two heights or more, in metres, negative below the surface of the sea; one with --set archive.level=HEIGHT";
+                let accepted = match columns.formula.is_of_air() {
+                    true => "two heights or more, in metres; one with --set archive.level=HEIGHT",
+                    false => "two heights or more, in metres, negative below the surface; one with --set archive.level=-DEPTH",
+                };
                 Err(SourceError::setting("heights", format!("{heights:?}"), accepted))
             }
             (None, Some(heights), None) => Ok(heights.clone()),

@@ -237,14 +237,14 @@ impl Planner<'_> {
     /// Refuses a later file whose points differ from those of the first. Compares the first and the last row, which cost little to
     /// read.
     fn check_points(&self, points: &[Points], first: &Curvilinear) -> Result<(), SourceError> {
-        for (k, (own, mesh)) in points.iter().zip(&first.meshes).enumerate() {
-            if own.cells != Cells::Rows {
-                if !points[..k].contains(own) {
-                    self.check_unstructured(own, mesh)?;
+        for (k, mesh) in first.meshes.iter().enumerate().take(points.len()) {
+            let (points, before) = (&points[k], &points[..k]);
+            if points.cells != Cells::Rows {
+                if !before.contains(points) {
+                    self.check_unstructured(points, mesh)?;
                 }
                 continue;
             }
-            let points = own;
             let whole = if points.between == [false; 2] { None } else { Some(self.mesh(points)?) };
             let whole = [whole.as_ref().map(|mesh| &mesh.longitude), whole.as_ref().map(|mesh| &mesh.latitude)];
             for ((&index, known), whole) in points.pair.iter().zip([&mesh.longitude, &mesh.latitude]).zip(whole) {
