@@ -5,6 +5,8 @@ mod cli;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    // SAFETY: no thread has been started.
+    unsafe { ridgewatch::source::read_without_locks() };
     let arguments = match cli::Arguments::read() {
         Ok(arguments) => arguments,
         Err(error) => {

@@ -1,6 +1,6 @@
 //! Errors of the sources. Each names the file, the variable, what was found and what is accepted.
 
-use super::formats::FormatError;
+use super::formats::{FormatError, FormatFault};
 use ridgewatch_base::setting::Refused;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -145,6 +145,11 @@ impl SourceError {
     /// A file whose contents do not fit.
     pub(super) fn file(path: &Path, what: impl ToString) -> Self {
         Self::File { path: path.into(), what: what.to_string() }
+    }
+
+    /// True for a file that another process has locked.
+    pub(super) fn is_locked(&self) -> bool {
+        matches!(self, Self::Format(FormatError { fault: FormatFault::Locked(_), .. }))
     }
 
     /// A variable that does not fit.

@@ -29,7 +29,7 @@ pub use archive::{
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use cf::calendar::utc;
 pub use error::SourceError;
-pub use formats::{FormatError, FormatFault, hdf5_version, is_url, netcdf_version, report_crashes};
+pub use formats::{FormatError, FormatFault, hdf5_version, is_url, netcdf_version, read_without_locks, report_crashes};
 pub use georeference::{Coordinate, Georeference, GridMapping, MappingValue, Positions};
 pub use grids::{FileOrder, InFile};
 pub use snapshots::{Listener, News, SnapshotSource, SourceDescription, StillReading, TimeGap, window_snapshots};

@@ -2,6 +2,7 @@
 
 use crate::kit::netcdf::*;
 use crate::{DAYS, open_with, refused};
+use ridgewatch::field::Snapshot;
 use ridgewatch::source::{ReadAhead, SnapshotSource, follow};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -11,9 +12,13 @@ const LONGEST: Duration = Duration::from_secs(60);
 
 /// A file of these days, in which u is the day; `parts` of its components.
 fn fixture(days: &[f64], parts: &[&str]) -> Fixture {
+    fixture_as(CLASSIC, days, parts)
+}
+
+fn fixture_as(format: Format, days: &[f64], parts: &[&str]) -> Fixture {
     let nodes = |value: &dyn Fn(f64) -> f64| f32s(days.iter().flat_map(|&day| [value(day); 12]).collect());
     let fixture = Fixture::on(
-        CLASSIC,
+        format,
         &[("time", DAYS, days), ("lat", "degrees_north", &[10.0, 11.0, 12.0]), ("lon", "degrees_east", &[5.0, 6.0, 7.0, 8.0])],
     );
     parts.iter().fold(fixture, |fixture, part| {
@@ -32,14 +37,14 @@ fn put(dir: &Path, name: &str, fixture: &Fixture) -> PathBuf {
 
 /// The days of the next snapshots, by their values.
 fn next(reader: &mut ReadAhead, count: usize) -> Vec<f64> {
-    (0..count)
-        .map(|_| {
-            let snapshot = reader.next_within(LONGEST).expect("no snapshot came").expect("the archive ended").unwrap();
-            let node = snapshot.nodes[5];
-            let speed = (0..3).map(|k| f64::from(node[k]).powi(2)).sum::<f64>().sqrt();
-            (speed * speed - 0.25).sqrt().round()
-        })
-        .collect()
+    (0..count).map(|_| day(&reader.next_within(LONGEST).expect("no snapshot came").expect("the archive ended").unwrap())).collect()
+}
+
+/// Day of a snapshot, by its values.
+fn day(snapshot: &Snapshot) -> f64 {
+    let node = snapshot.nodes[5];
+    let speed = (0..3).map(|k| f64::from(node[k]).powi(2)).sum::<f64>().sqrt();
+    (speed * speed - 0.25).sqrt().round()
 }
 
 fn followed(dir: &Path, pattern: &str, longest: Duration) -> ReadAhead {
@@ -112,9 +117,19 @@ fn records_that_are_appended_are_read() {
     }
     let mut reader = followed(dir.path(), "*.nc", LONGEST);
     assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
-    write(3, &mut netcdf::append(&path).unwrap());
+    // The library refuses to write to a file that this process has open, as the reader has until it looks for more.
+    let append = || {
+        let begin = Instant::now();
+        loop {
+            match netcdf::append(&path) {
+                Err(_) if begin.elapsed() < LONGEST => std::thread::sleep(Duration::from_millis(5)),
+                file => return file.unwrap(),
+            }
+        }
+    };
+    write(3, &mut append());
     assert_eq!(next(&mut reader, 1), [3.0]);
-    write(4, &mut netcdf::append(&path).unwrap());
+    write(4, &mut append());
     assert_eq!(next(&mut reader, 1), [4.0]);
 }
 
@@ -187,4 +202,39 @@ fn waiting_ends_after_the_longest_time_and_when_nobody_reads() {
     refused(&[dir.path().join("a.nc")], "follow = 0", &["follow", "seconds above 0"]);
     refused(&[dir.path().join("a.nc")], "follow = 5\nmetric = \"index\"", &["follow", "index metric"]);
     refused(&[dir.path().join("a.nc")], "follow = 5\nsteady = true", &["follow", "steady"]);
+}
+
+#[test]
+fn a_file_that_changes_while_it_is_open_is_opened_again() {
+    let dir = tempdir().unwrap();
+    let path = put(dir.path(), "a.nc", &fixture(&[1.0, 2.0], &["u", "v"]));
+    let mut archive = open_with(&[&path], "mask = \"none\"");
+    assert_eq!(day(&archive.read(1).unwrap()), 2.0);
+    // In place, with the data elsewhere.
+    let longer = fixture(&[1.0, 3.0], &["u", "v"]).with("comment", "a longer header").write(&dir.path().join("b"));
+    std::fs::write(&path, std::fs::read(longer).unwrap()).unwrap();
+    assert_eq!(day(&archive.read(1).unwrap()), 3.0);
+}
+
+#[test]
+fn a_locked_file_is_waited_for_within_a_limit() {
+    let dir = tempdir().unwrap();
+    let file = |name: &str, day: f64| fixture_as(NETCDF4, &[day], &["u", "v"]).write(&dir.path().join(name));
+    let (first, second) = (file("a.nc", 1.0), file("b.nc", 2.0));
+    let mut archive = open_with(&[&first, &second], "mask = \"none\"");
+    let lock = std::fs::File::open(&second).unwrap();
+    // An exclusive lock waits until the archive has closed its file.
+    archive.read(0).unwrap();
+    lock.lock().unwrap();
+    let begin = Instant::now();
+    let error = archive.read(1).unwrap_err().to_string();
+    assert!(error.contains("b.nc: cannot be locked: another process has locked it"), "{error}");
+    assert!((30.0..60.0).contains(&begin.elapsed().as_secs_f64()), "{:?}", begin.elapsed());
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            std::thread::sleep(Duration::from_secs(1));
+            lock.unlock().unwrap();
+        });
+        assert_eq!(day(&archive.read(1).unwrap()), 2.0);
+    });
 }

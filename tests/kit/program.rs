@@ -4,6 +4,7 @@ use ridgewatch::run::FrameRecord;
 use serde_json::Value;
 use std::ffi::OsStr;
 use std::io::{Read, Write};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
@@ -157,6 +158,14 @@ impl Drop for Running {
 
 /// Starts a process.
 pub fn start(command: &mut Command) -> Running {
+    let close = || {
+        // Files that another test writes: the process would hold their locks. Systems that cannot (before Linux 5.11) leave them open.
+        // SAFETY: a system call without pointers.
+        unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
+        Ok(())
+    };
+    // SAFETY: only a system call between fork and exec.
+    unsafe { command.pre_exec(close) };
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap_or_else(|error| panic!("{command:?}: {error}"));
     let output = [Collected::from(child.stdout.take().unwrap()), Collected::from(child.stderr.take().unwrap())];
     Running { child, command: format!("{:?}", command.get_args()), output: Some(output) }

@@ -70,6 +70,69 @@ fn an_archive_that_is_followed_gives_the_slides_that_come() {
     assert_eq!(summary(&out)["run"]["slides"], 5);
 }
 
+/// HDF5 locks files that it reads, and a solver that cannot open its file to append to it ends.
+#[test]
+fn a_solver_appends_to_the_file_that_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, out) = (folder.path().join("growing.nc"), folder.path().join("run"));
+    let write = |file: &mut netcdf::FileMut, day: usize| {
+        file.variable_mut("time").unwrap().put_values(&[day as f64], day..=day).unwrap();
+        for (name, sign) in [("u", -1.0), ("v", 1.0)] {
+            let values: Vec<f32> = (0..32 * 32).map(|i| sign * ([i / 32, i % 32][usize::from(name == "v")] as f32 - 15.5) / 8.0).collect();
+            file.variable_mut(name).unwrap().put_values(&values, (day..=day, 0..32, 0..32)).unwrap();
+        }
+    };
+    {
+        let mut new = netcdf::create(&file).unwrap();
+        new.add_unlimited_dimension("time").unwrap();
+        for (name, units) in [("lat", "degrees_north"), ("lon", "degrees_east")] {
+            new.add_dimension(name, 32).unwrap();
+            let mut axis = new.add_variable::<f64>(name, &[name]).unwrap();
+            axis.put_attribute("units", units).unwrap();
+            axis.put_values(&(0..32).map(|i| 10.0 + 0.25 * f64::from(i)).collect::<Vec<_>>(), ..).unwrap();
+        }
+        new.add_variable::<f64>("time", &["time"]).unwrap().put_attribute("units", "days since 2000-01-01").unwrap();
+        for name in ["u", "v"] {
+            new.add_variable::<f32>(name, &["time", "lat", "lon"]).unwrap().put_attribute("units", "m/s").unwrap();
+        }
+        (0..6).for_each(|day| write(&mut new, day));
+    }
+    let records_file = out.join("records.jsonl");
+    let solver = || {
+        // In each thread, libhdf5 prints errors that libnetcdf expects.
+        hdf5_metno::silence_errors(true);
+        let begin = Instant::now();
+        while std::fs::read_to_string(&records_file).map_or(0, |text| text.lines().count()) < 1 {
+            assert!(begin.elapsed() < Duration::from_secs(120), "no frame came");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        // The run reads three days more, and has the file open.
+        for day in 6..12 {
+            write(&mut netcdf::append(&file).expect("the solver's file is locked"), day);
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    };
+    std::thread::scope(|scope| {
+        scope.spawn(solver);
+        let keys = set(&["time.tau=2 days", "time.slides=10", "render.method=reference"]);
+        replay(text(&file), &out, &[&["--follow=120"], &keys[..]].concat());
+    });
+    let dates: Vec<String> = records(&out).into_iter().map(|r| r.date.unwrap()).collect();
+    assert_eq!(dates, (3..13).map(|day| format!("2000-01-{day:02}T00:00:00Z")).collect::<Vec<_>>());
+}
+
+/// The program takes no locks, and heeds those of others.
+#[test]
+fn a_file_that_another_process_has_locked_is_refused_unless_locks_are_off() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = eddy(folder.path());
+    let locked = std::fs::File::open(&file).unwrap();
+    locked.lock().unwrap();
+    let mut inspect = program::ridgewatch(["inspect", text(&file)]);
+    run(&mut inspect).refused(1, &["eddy.nc", "another process has locked it", "HDF5_USE_FILE_LOCKING=FALSE"]);
+    run(inspect.env("HDF5_USE_FILE_LOCKING", "FALSE")).success();
+}
+
 #[test]
 fn an_archive_with_land_goes_through_the_whole_loop() {
     let folder = tempfile::tempdir().unwrap();

@@ -2,7 +2,7 @@
 
 use super::check::{check, check_fit};
 use super::files::expand;
-use super::follow::Followed;
+use super::follow::{Followed, Stamp, stamps};
 use super::group::{Group, grouped, open_group};
 use super::limits;
 use super::synthetic::{declared, synthesized};
@@ -21,6 +21,7 @@ use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_ga
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// Names of the components, in order.
 const COMPONENTS: [&str; 3] = ["u", "v", "w"];
@@ -31,6 +32,15 @@ pub(super) struct ArchiveFile {
     /// With files of other components, meshes and masks.
     pub(super) group: Group,
     pub(super) frames: Vec<Vec<ComponentPlan>>,
+}
+
+/// The file that is open, or files that are read as one.
+pub(super) struct OpenFile {
+    /// Index in [`Archive::files`].
+    index: usize,
+    data: DataFile,
+    /// As the files were before they were opened.
+    stamps: Vec<Option<Stamp>>,
 }
 
 /// Shape of each component and, for each of its points, whether the velocity is always 0.
@@ -64,7 +74,7 @@ pub struct Archive {
     in_cells: bool,
     georeference: Georeference,
     description: SourceDescription,
-    pub(super) open: Option<(usize, DataFile)>,
+    pub(super) open: Option<OpenFile>,
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
     pub(super) limits: Limits,
@@ -126,6 +136,7 @@ impl Archive {
         let mut masks: Vec<Group> = Vec::new();
         for group in groups {
             let Some(path) = group.first().cloned() else { continue };
+            let stamps = stamps(&group);
             let (file, layout) = match open_next(&group, settings, first.as_ref(), expected.as_ref(), limits) {
                 Ok(both) => both,
                 Err(_) if is_mask_alone(&path, settings, limits) => {
@@ -160,7 +171,7 @@ impl Archive {
                     first = Some(layout);
                 }
             }
-            open = Some((index, file));
+            open = Some(OpenFile { index, data: file, stamps });
         }
         let Some(layout) = first else {
             let what = "it holds a mask of land, but no velocity: name the files of the velocity beside it";
@@ -266,7 +277,7 @@ impl Archive {
         let mut zeros = Zeros::new();
         for index in sampled(self.times.len()) {
             let place = self.open_at(index)?;
-            let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+            let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
             for (which, plan) in self.files[place.file].frames[place.frame].iter().enumerate().take(2) {
                 let orders = points(plan);
                 let values = read_component(file, plan, &orders, place.entry)?;
@@ -408,12 +419,13 @@ impl Archive {
     fn open_at(&mut self, index: usize) -> Result<Place, SourceError> {
         let missing = SourceError::NoSuchSnapshot { index, count: self.places.len() };
         let place = *self.places.get(index).ok_or(missing)?;
-        let file = match self.open.take() {
-            Some((open, file)) if open == place.file => file,
+        let open = match self.open.take() {
+            Some(open) if open.index == place.file => open,
             other => {
                 // Closed before the next file opens.
                 drop(other);
                 let ArchiveFile { path, group, frames } = &self.files[place.file];
+                let stamps = stamps(group);
                 let file = match group.len() {
                     1 => DataFile::open(path, self.expected.as_ref(), self.limits)?,
                     _ => open_group(group, self.limits)?,
@@ -430,20 +442,50 @@ impl Archive {
                         return Err(file.listing.read_error(&component.name, "it changed since the archive was opened").into());
                     }
                 }
-                file
+                OpenFile { index: place.file, data: file, stamps }
             }
         };
-        self.open = Some((place.file, file));
+        self.open = Some(open);
         Ok(place)
     }
 
     /// The components of a snapshot in SI (or unchanged, in cells), the third along the grid's third axis; x fastest; missing values
-    /// are NaN.
+    /// are NaN. Files that are written to meanwhile are read again.
     fn components(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
+        let group = self.places.get(index).map_or_else(Vec::new, |place| self.files[place.file].group.clone());
+        let patience = self.followed.as_ref().map_or(PATIENCE, |followed| followed.longest().max(PATIENCE));
+        let begin = Instant::now();
+        let mut is_told = false;
+        loop {
+            let before = match &self.open {
+                Some(open) if self.places[index].file == open.index => open.stamps.clone(),
+                _ => stamps(&group),
+            };
+            let read = self.components_once(index);
+            // What is read during a write may be of two states of the file.
+            let error = match read {
+                _ if stamps(&group) != before => SourceError::file(&group[0], "it was written to while it was read"),
+                Err(error) if error.is_locked() => error,
+                read => return read,
+            };
+            self.open = None;
+            if begin.elapsed() >= patience {
+                return Err(error);
+            }
+            if !is_told && begin.elapsed() >= TELL {
+                tracing::warn!("{error}; it is read again until it rests, for at most {} s", patience.as_secs());
+                is_told = true;
+            }
+            std::thread::sleep(PAUSE);
+        }
+    }
+
+    /// [`Self::components`], from files that stay as they are.
+    fn components_once(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
         let orders: Orders = std::array::from_fn(|k| self.axes.get(k).map_or_else(|| vec![0], |a| a.order.clone()));
         let resampling = self.resampling.clone();
         let place = self.open_at(index)?;
-        let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+        let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
         let plans = &self.files[place.file].frames[place.frame];
         let mut components = match resampling {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
@@ -472,7 +514,7 @@ impl Archive {
             let node = MESH_NODE_BYTES + (NODE_BYTES + held as u64) * levels as u64;
             let most = self.limits.memory / 2 / node;
             let Place { file: index, frame, entry } = self.open_at(0)?;
-            let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+            let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
             let truth = mesh.truth(file, &self.files[index].frames[frame], entry, false)?;
             refined = mesh.refined(&truth, usize::try_from(most).unwrap_or(usize::MAX), levels);
         }
@@ -498,7 +540,7 @@ impl Archive {
     pub(super) fn resampling_error(&mut self) -> Result<Option<ResamplingError>, SourceError> {
         let Some(resampling) = self.resampling.clone() else { return Ok(None) };
         let Place { file: index, frame, entry } = self.open_at(0)?;
-        let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+        let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
         resampling.error(file, &self.files[index].frames[frame], entry).map(Some)
     }
 }
@@ -582,6 +624,13 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<
         _ => expand(paths),
     }
 }
+
+/// Least time for which a file that is written to is read again.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Time after which the log tells of it.
+const TELL: Duration = Duration::from_secs(5);
+/// Time before a file is read again.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// Bytes of a node while a snapshot is read: a value of the file, in the library and converted; three components; the snapshot.
 const NODE_BYTES: u64 = 2 * 8 + 3 * 4 + 16;

@@ -10,13 +10,13 @@ use crate::grids::{ComponentPlan, Layout, difference};
 use crate::snapshots::{News, SnapshotSource};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 /// Looks after which a file that changes at each of them is told.
 const RESTLESS: u32 = 60;
 
 /// Length of a file and time of its last change.
-type Stamp = (u64, Option<SystemTime>);
+pub(super) type Stamp = (u64, Option<SystemTime>);
 
 /// What is known of the files of an archive that is followed.
 pub(super) struct Followed {
@@ -37,7 +37,17 @@ fn stamp(path: &Path) -> Option<Stamp> {
     path.metadata().ok().map(|found| (found.len(), found.modified().ok()))
 }
 
+/// Files as they are; `None` for what is not there, and for URLs.
+pub(super) fn stamps(group: &Group) -> Vec<Option<Stamp>> {
+    group.iter().map(|path| stamp(path)).collect()
+}
+
 impl Followed {
+    /// Time to wait for a further snapshot.
+    pub(super) fn longest(&self) -> Duration {
+        Duration::from_secs_f64(self.settings.follow.unwrap_or_default())
+    }
+
     /// Files as they are before they are read.
     ///
     /// # Errors
@@ -117,7 +127,7 @@ impl Archive {
     pub(super) fn look_for_news(&mut self) -> News {
         let mut news = News::default();
         let Some(mut followed) = self.followed.take() else { return news };
-        // An open file shows what it held when it was opened, and may keep others from writing to it.
+        // An open file shows what it held when it was opened.
         self.open = None;
         let before = self.times.len();
         match expand(&followed.paths) {

@@ -8,10 +8,11 @@ use std::cell::Cell;
 use std::ffi::{CString, c_char, c_int};
 use std::fmt::Display;
 use std::fs::TryLockError;
+use std::os::unix::fs::MetadataExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::ptr::null;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -23,8 +24,11 @@ pub fn guarded<T>(path: &Path, read: impl FnOnce() -> T) -> Option<T> {
 /// Opens a file through a C library, within a time limit.
 ///
 /// # Errors
-/// The library fails or panics (`panicked` is the message then), or cannot lock the file.
+/// The library fails or panics (`panicked` is the message then), or cannot lock the file; another process has locked it.
 pub fn open_guarded<T, E: Display>(path: &Path, panicked: &str, open: impl FnOnce() -> Result<T, E>) -> Result<T, FormatError> {
+    if READS_WITHOUT_LOCKS.load(Ordering::Relaxed) && is_locked_for_writing(path) {
+        return Err(FormatFault::Locked(WRITTEN.into()).of(path));
+    }
     let damaged = |what: String| FormatFault::Damaged(what).of(path);
     match run(Reading::opening(path), open) {
         Some(opened) => opened.map_err(|error| locked(path, &error.to_string()).unwrap_or_else(|| damaged(error.to_string()))),
@@ -46,18 +50,50 @@ pub fn silence() {
     }
 }
 
+/// The variable that tells libhdf5 whether to lock the files that it opens.
+const FILE_LOCKING: &str = "HDF5_USE_FILE_LOCKING";
+/// Why a lock is not to be had.
+const WRITTEN: &str = "another process has locked it, perhaps since it is still being written";
+/// True after [`read_without_locks`], unless the environment decides.
+static READS_WITHOUT_LOCKS: AtomicBool = AtomicBool::new(false);
+
+/// Reads files without locking them from now on, unless `HDF5_USE_FILE_LOCKING` is set: a solver that opens a file to append fails while a reader
+/// holds a lock. Files that another process has locked for writing are still refused, where the system lists locks. For programs, before they start
+/// threads.
+///
+/// # Safety
+/// No other thread reads or changes the environment meanwhile.
+pub unsafe fn read_without_locks() {
+    if std::env::var_os(FILE_LOCKING).is_none() {
+        // SAFETY: the caller's.
+        unsafe { std::env::set_var(FILE_LOCKING, "FALSE") };
+        READS_WITHOUT_LOCKS.store(true, Ordering::Relaxed);
+    }
+}
+
+/// True if Linux lists a lock for writing on this file. Asking for the lock instead could make the writer's own attempt fail.
+fn is_locked_for_writing(path: &Path) -> bool {
+    let (Ok(file), Ok(locks)) = (path.metadata(), std::fs::read_to_string("/proc/locks")) else { return false };
+    let place = format!("{:02x}:{:02x}:{}", libc::major(file.dev()), libc::minor(file.dev()), file.ino());
+    // Number, kind, "ADVISORY", "WRITE" or "READ", process, place, first and last byte.
+    locks
+        .lines()
+        .map(|line| line.split_whitespace().collect::<Vec<_>>())
+        .any(|lock| lock.get(3) == Some(&"WRITE") && lock.get(5) == Some(&&*place))
+}
+
 /// Checks whether a file failed to open because it could not be locked, which the libraries do not say.
 fn locked(path: &Path, what: &str) -> Option<FormatError> {
     // As libhdf5 reads it.
-    if std::env::var_os("HDF5_USE_FILE_LOCKING").is_some_and(|value| value == "FALSE" || value == "0") {
+    if std::env::var_os(FILE_LOCKING).is_some_and(|value| value == "FALSE" || value == "0") {
         return None;
     }
     let why = match std::fs::File::open(path).ok()?.try_lock_shared() {
         Ok(()) => return None,
-        Err(TryLockError::WouldBlock) => "another process has locked it, perhaps since it is still being written".to_owned(),
+        Err(TryLockError::WouldBlock) => WRITTEN.to_owned(),
         Err(TryLockError::Error(error)) => format!("its file system says {error}"),
     };
-    Some(FormatFault::Locked(why, what.into()).of(path))
+    Some(FormatFault::Locked(format!("{why} (the library: {what})")).of(path))
 }
 
 thread_local! {

@@ -273,12 +273,9 @@ pub enum FormatFault {
     /// The operating system refuses, with this error.
     #[error("cannot be opened: {0}")]
     Open(String),
-    /// HDF5 locks a file before it reads it, and the lock failed: the reason, and the error of the library.
-    #[error(
-        "cannot be locked, as HDF5 does before it reads: {0} (the library: {1}). To read it all the same, set \
-         HDF5_USE_FILE_LOCKING=FALSE in the environment"
-    )]
-    Locked(String, String),
+    /// Another process writes to the file, or HDF5 cannot lock it, for this reason.
+    #[error("cannot be locked: {0}. To read it all the same, set HDF5_USE_FILE_LOCKING=FALSE in the environment")]
+    Locked(String),
     /// Another format, perhaps this one.
     #[error(
         "neither NetCDF, HDF5, GRIB nor Zarr ({0}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4, HDF5, GRIB 1 and 2, \

@@ -23,7 +23,7 @@ mod write;
 mod zarr;
 
 pub use data_file::DataFile;
-pub use guard::report_crashes;
+pub use guard::{read_without_locks, report_crashes};
 pub use libraries::{hdf5_version, netcdf_version};
 pub use limits::Limits;
 pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, UNREADABLE, Variable};
