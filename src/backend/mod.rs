@@ -107,8 +107,8 @@ pub trait Backend: Send + Sync + Sized {
         MOST_REFINED_NODES
     }
 
-    /// Nodes of a finer table that are traced for every sample of a frame, so that a frame of `two_level` takes about twice as long.
-    fn nodes_per_sample(&self) -> usize {
+    /// Nodes of a finer table that a sample of a frame is worth, and those that take as long as it does.
+    fn nodes_per_sample(&self) -> [usize; 2] {
         NODES_PER_SAMPLE
     }
 
@@ -130,8 +130,8 @@ pub trait Backend: Send + Sync + Sized {
 
 /// Largest number of nodes of a refined table on the CPU: 64 MiB.
 const MOST_REFINED_NODES: usize = 1 << 24;
-/// Nodes that the CPU traces for every sample of a frame.
-const NODES_PER_SAMPLE: usize = 16;
+/// [`Backend::nodes_per_sample`] of the CPU.
+const NODES_PER_SAMPLE: [usize; 2] = [16, 16];
 
 /// Frozen surrogate of a backend.
 pub type FrozenOf<B> = <<B as Backend>::Surrogate as Surrogate>::Frozen;

@@ -724,7 +724,8 @@ impl<B: Backend> Cycle<'_, B> {
                     true => Some(since_command.map_or(0, |frames| FRAMES_WHILE_PAUSED.saturating_sub(frames))),
                     false => (!is_open).then(|| planned.saturating_sub(number)),
                 };
-                place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before })?;
+                let is_only_slide = slide.index == 0 && slides.is_over();
+                place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
             }
             transaction!(self, slide, run, on => run.learn_shorter(on, slide));
             let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));

@@ -23,6 +23,17 @@ pub(super) struct Frames {
     pub(super) left: Option<usize>,
     /// Frames of the slide before; 0 for the first.
     pub(super) before: usize,
+    /// True if the run has no other slide.
+    pub(super) is_only_slide: bool,
+}
+
+/// Nodes of a finer table for a frame.
+#[derive(Debug, Clone, Copy)]
+struct NodesPerFrame {
+    /// As many as its samples are worth.
+    worth: f64,
+    /// As many as take as long as its samples.
+    as_long: f64,
 }
 
 impl Frames {
@@ -31,15 +42,18 @@ impl Frames {
         self.left.unwrap_or(self.shown.max(self.before.saturating_sub(self.shown)))
     }
 
-    /// Nodes to trace before the next frame for a table of `nodes` in all, with `per_frame` nodes for a frame; 0 if it does not pay. It does if tracing takes
-    /// at most half of the frames that are expected. A slide of a single frame has nothing to show meanwhile, and gets the whole table at once.
-    fn part(self, nodes: usize, per_frame: f64) -> usize {
-        let pays = 2.0 * nodes as f64 <= per_frame * self.expected() as f64;
+    /// Nodes to trace before the next frame for a table of `nodes` in all; 0 if it does not pay. It does if tracing takes at most half of the frames that are
+    /// expected. A slide of a single frame has nothing to show meanwhile, and gets the whole table at once; if others follow, it takes at most twice as
+    /// long for that.
+    fn part(self, nodes: usize, per_frame: NodesPerFrame) -> usize {
+        let nodes = nodes as f64;
+        let pays = 2.0 * nodes <= per_frame.worth * self.expected() as f64;
+        let slides_on = !self.is_only_slide && nodes > per_frame.as_long;
         match (pays, self.shown) {
             (false, _) => 0,
-            (true, 0) if self.left == Some(1) => usize::MAX,
+            (true, 0) if self.left == Some(1) && !slides_on => usize::MAX,
             (true, 0) => 0,
-            (true, _) => (per_frame as usize).max(1),
+            (true, _) => (per_frame.worth as usize).max(1),
         }
     }
 }
@@ -74,11 +88,11 @@ impl Run<'_> {
         let RenderSettings { width, height, samples, method, .. } = self.render;
         // The samples of `marched` only measure its error.
         let samples = if method == Method::Marched { 1.0 } else { samples };
-        let per_frame = (width * height * backend.nodes_per_sample()) as f64 * samples;
+        let [worth, as_long] = backend.nodes_per_sample().map(|nodes| (width * height * nodes) as f64 * samples);
         let part = match surrogate.finer_nodes() {
-            Some(begun) if begun == to => (per_frame as usize).max(1),
+            Some(begun) if begun == to => (worth as usize).max(1),
             _ if all > backend.most_refined_nodes() => 0,
-            _ => frames.part(all, per_frame),
+            _ => frames.part(all, NodesPerFrame { worth, as_long }),
         };
         if part == 0 {
             return Ok(None);
@@ -130,27 +144,35 @@ impl<B: Backend> Cycle<'_, B> {
 mod tests {
     use super::*;
 
+    const FEW: NodesPerFrame = NodesPerFrame { worth: 100.0, as_long: 50.0 };
+
     fn left(shown: usize, left: usize) -> Frames {
-        Frames { shown, left: Some(left), before: 0 }
+        Frames { shown, left: Some(left), before: 0, is_only_slide: true }
     }
 
     #[test]
     fn a_finer_table_pays_if_tracing_it_takes_half_of_the_frames_at_most() {
-        assert_eq!(left(1, 9).part(500, 100.0), 0);
-        assert_eq!(left(1, 10).part(500, 100.0), 100);
-        assert_eq!(left(0, 10).part(500, 100.0), 0, "the first picture comes soon");
-        assert_eq!(left(0, 1).part(50, 100.0), usize::MAX, "a picture of many samples begins with the finer table");
-        assert_eq!(left(0, 1).part(51, 100.0), 0);
+        assert_eq!(left(1, 9).part(500, FEW), 0);
+        assert_eq!(left(1, 10).part(500, FEW), 100);
+        assert_eq!(left(0, 10).part(500, FEW), 0, "the first picture comes soon");
+        assert_eq!(left(0, 1).part(50, FEW), usize::MAX, "a picture of many samples begins with the finer table");
+        assert_eq!(left(0, 1).part(51, FEW), 0);
+    }
+
+    #[test]
+    fn a_window_that_slides_at_every_frame_takes_at_most_twice_as_long() {
+        let part = |nodes, as_long| Frames { is_only_slide: false, ..left(0, 1) }.part(nodes, NodesPerFrame { as_long, ..FEW });
+        assert_eq!([part(40, 40.0), part(40, 39.0)], [usize::MAX, 0]);
     }
 
     #[test]
     fn without_an_end_a_picture_is_expected_to_stand_as_long_as_it_stood() {
-        let open = |shown, before| Frames { shown, left: None, before };
-        assert_eq!(open(9, 0).part(500, 100.0), 0);
-        assert_eq!(open(10, 0).part(500, 100.0), 100);
-        assert_eq!(open(1, 11).part(500, 100.0), 100, "the slide before had eleven frames");
-        assert_eq!(open(1, 10).part(500, 100.0), 0);
-        assert_eq!(open(0, 1).part(0, 100.0), 0, "a slide whose end is open may have more frames than one");
+        let open = |shown, before| Frames { shown, left: None, before, is_only_slide: false };
+        assert_eq!(open(9, 0).part(500, FEW), 0);
+        assert_eq!(open(10, 0).part(500, FEW), 100);
+        assert_eq!(open(1, 11).part(500, FEW), 100, "the slide before had eleven frames");
+        assert_eq!(open(1, 10).part(500, FEW), 0);
+        assert_eq!(open(0, 1).part(0, FEW), 0, "a slide whose end is open may have more frames than one");
     }
 
     #[test]

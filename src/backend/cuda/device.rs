@@ -26,8 +26,8 @@ use std::sync::atomic::AtomicBool;
 /// Largest number of nodes of a refined table, 1 GiB, and the share of the free memory that it takes at most.
 const MOST_REFINED_NODES: usize = 1 << 28;
 const REFINED_SHARE: u64 = 4;
-/// Nodes of a finer table that are traced for every sample of a frame: neighbouring nodes trace far faster than the queries of a frame.
-const NODES_PER_SAMPLE: usize = 64;
+/// [`crate::Backend::nodes_per_sample`]: frames are so short that one that traces nodes may take four times as long.
+const NODES_PER_SAMPLE: [usize; 2] = [64, 8];
 
 /// A picture of the CUDA backend.
 pub struct CudaPicture {
@@ -214,7 +214,7 @@ impl Backend for Cuda {
         }
     }
 
-    fn nodes_per_sample(&self) -> usize {
+    fn nodes_per_sample(&self) -> [usize; 2] {
         if self.placement.frames == Place::Device { NODES_PER_SAMPLE } else { crate::NODES_PER_SAMPLE }
     }
 
