@@ -78,7 +78,7 @@ impl Backend for Timed {
     fn most_refined_nodes(&self) -> usize {
         self.inner.most_refined_nodes()
     }
-    fn nodes_per_sample(&self) -> usize {
+    fn nodes_per_sample(&self) -> [usize; 2] {
         self.inner.nodes_per_sample()
     }
     fn replan(
