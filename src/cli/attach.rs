@@ -82,7 +82,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, RunError::refused))
     };
     let follows = Some(Follows { checkpoint_seconds: CHECKPOINT_SECONDS, resume_if_fit, wanted });
-    Session { common, options: &options.run, scene, text, follows }.run(open)
+    Session { common, options: &options.run, scene, text, follows, chart: None }.run(open)
 }
 
 /// Reads the scene, with the places of the simulation from the command line.

@@ -1,6 +1,6 @@
 //! `ridgewatch chart`: speed against accuracy of a scene, and the pick.
 
-use super::common::{Common, Interrupted, Usage, device, located, print_json, print_text, scene, seconds};
+use super::common::{Common, Interrupted, Usage, chart_beside, device, located, print_json, print_text, scene, seconds};
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
@@ -27,7 +27,8 @@ pub struct Options {
     /// Panels: ftle (error and cost of FTLE samples), pictures (time to error), scaling (cost against tau, nodes, threads).
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Panel::Ftle, Panel::Pictures, Panel::Scaling], value_name = "PANELS")]
     only: Vec<Panel>,
-    /// Folder for chart.png, chart.svg, chart.csv and chart.json. Files of these names are replaced.
+    /// Folder for chart.png, chart.svg, chart.csv and chart.json. Files of these names are replaced. Beside a scene file, SCENE.chart.svg is written for
+    /// the dashboard.
     #[arg(long, short, default_value = "out/chart")]
     out: PathBuf,
 }
@@ -77,6 +78,11 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         ("chart.png", write_png(&chart)?),
         ("chart.json", serde_json::to_vec_pretty(&report)?),
     ];
+    if let Some(path) = chart_beside(&options.paths)
+        && let Err(error) = write_whole(&path, &files[1].1)
+    {
+        messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display()));
+    }
     for (name, bytes) in files {
         let path = options.out.join(name);
         write_whole(&path, &bytes).with_context(|| format!("cannot write {}", path.display()))?;

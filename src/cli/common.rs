@@ -98,6 +98,14 @@ pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
     Ok(scene)
 }
 
+/// Where `chart` leaves the chart of a scene file for the dashboard.
+pub fn chart_beside(paths: &[PathBuf]) -> Option<PathBuf> {
+    match paths {
+        [one] if is_config(one) => Some(one.with_extension("chart.svg")),
+        _ => None,
+    }
+}
+
 /// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene and data on the same
 /// device. Returns the decision; `None` if the scene names a method.
 pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<Option<Decision>> {

@@ -2,7 +2,7 @@
 
 use super::common::{Common, Usage, print_json, print_text};
 use super::messages;
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
 use ridgewatch::publish::{DEFAULT_ENDPOINT, NewestFrame};
 use ridgewatch::steer::default_connection;
@@ -33,18 +33,25 @@ pub struct Options {
     /// Let the page steer the run whose connection file this is (`replay --steer`, `attach --steer`); by default the one of the private socket.
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<PathBuf>>,
+    /// Show this chart of speed against accuracy, a chart.svg of `ridgewatch chart`.
+    #[arg(long, value_name = "FILE")]
+    chart: Option<PathBuf>,
 }
 
 /// Serves the page until a signal comes.
 pub fn run(common: &Common, options: Options) -> Result<()> {
     if !common.overrides.is_empty() {
-        bail!(Usage("--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer".into()));
+        bail!(Usage(
+            "--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --chart".into()
+        ));
     }
-    let Options { endpoint, port, bind: address, allow_host: hosts, token_file, steer } = options;
+    let Options { endpoint, port, bind: address, allow_host: hosts, token_file, steer, chart } = options;
     let steer = steer.map(|file| file.map_or_else(default_connection, Ok)).transpose()?;
     let token = token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
     let is_steered = steer.is_some();
-    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer, newest: None })?;
+    let read = |file: PathBuf| std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()));
+    let chart = chart.map(read).transpose()?;
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer, newest: None, chart })?;
     if !address.is_loopback() {
         messages::note(format_args!(
             "{} is open to other machines: without encryption, whoever reads the network sees frames and token",
@@ -67,10 +74,17 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 
 /// Starts a dashboard beside a run that publishes at `endpoint`, keeps its newest frame, and takes commands if it has a connection file. Without one
 /// the run goes on.
-pub fn beside(common: &Common, endpoint: String, port: Option<u16>, steer: Option<PathBuf>, newest: Arc<NewestFrame>) -> Option<Dashboard> {
+pub fn beside(
+    common: &Common,
+    endpoint: String,
+    port: Option<u16>,
+    steer: Option<PathBuf>,
+    newest: Arc<NewestFrame>,
+    chart: Option<Vec<u8>>,
+) -> Option<Dashboard> {
     let is_steered = steer.is_some();
     let started = Token::random().map_err(Into::into).and_then(|token| {
-        Dashboard::start(DashboardSettings { steer, newest: Some(newest), ..DashboardSettings::local(endpoint, port, token) })
+        Dashboard::start(DashboardSettings { steer, newest: Some(newest), chart, ..DashboardSettings::local(endpoint, port, token) })
     });
     match started {
         Ok(dashboard) => {

@@ -108,6 +108,8 @@ pub struct Session<'a> {
     pub text: String,
     /// `None` for replays.
     pub follows: Option<Follows>,
+    /// Where a chart of the scene would be.
+    pub chart: Option<PathBuf>,
 }
 
 /// What a run that follows a simulation has besides.
@@ -123,7 +125,7 @@ pub struct Follows {
 impl Session<'_> {
     /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
     pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
-        let Self { common, options, scene, text, follows: following } = self;
+        let Self { common, options, scene, text, follows: following, chart } = self;
         let wanted = following.as_ref().filter(|_| !options.overwrite).map(|following| following.wanted.as_path());
         // Before any wait or work. The folder is checked again when it is created, in case another run takes it meanwhile.
         match RunFolder::refuse_occupied(&options.out, options.overwrite) {
@@ -185,7 +187,8 @@ impl Session<'_> {
         let shown = options.dashboard.zip(output.endpoint());
         let dashboard = shown.and_then(|(port, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
-            dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest))
+            let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());
+            dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest), chart)
         });
         if dashboard.is_some() {
             output.keep_newest(newest);

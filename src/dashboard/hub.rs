@@ -59,6 +59,8 @@ pub(super) struct Hub {
     /// For commands of the browsers.
     pub wheel: Wheel,
     pub pixels: Pixels,
+    /// SVG of speed against accuracy.
+    pub chart: Option<Bytes>,
 }
 
 /// The latest records, as JSON.
@@ -145,6 +147,8 @@ struct State<'a> {
     problem: Option<String>,
     steering: Reach,
     values: Kept<'a>,
+    /// Whether there is a chart of speed against accuracy.
+    has_chart: bool,
     /// Token that only watches, for pages that may steer.
     #[serde(skip_serializing_if = "Option::is_none")]
     token_to_share: Option<&'a str>,
@@ -158,11 +162,12 @@ struct Head {
 }
 
 impl Hub {
-    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels, chart: Option<Bytes>) -> Self {
         Self {
             endpoint,
             wheel,
             pixels,
+            chart,
             server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
             recorded: watch::Sender::new(0),
@@ -320,6 +325,7 @@ impl Hub {
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
             steering: self.wheel.reach_for(token_to_share.is_some()),
             values: self.pixels.kept(),
+            has_chart: self.chart.is_some(),
             token_to_share,
         };
         message(&serde_json::to_string(&state).unwrap_or_default(), &[])
@@ -430,7 +436,7 @@ mod tests {
 
     #[test]
     fn those_who_watch_push_out_nobody_who_steers() {
-        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None)));
+        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None), None));
         let steering = hub.enter(true);
         let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
         assert_eq!(left(&hub).len(), MAX_CLIENTS);

@@ -23,6 +23,7 @@ pub use token::Token;
 
 use crate::publish::NewestFrame;
 use access::Access;
+use bytes::Bytes;
 use hub::Hub;
 use pixels::Pixels;
 use ridgewatch_zmtp::{check_endpoint, private_endpoint};
@@ -57,12 +58,14 @@ pub struct DashboardSettings {
     pub steer: Option<PathBuf>,
     /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own.
     pub newest: Option<Arc<NewestFrame>>,
+    /// Chart of speed against accuracy, as SVG.
+    pub chart: Option<Vec<u8>>,
 }
 
 impl DashboardSettings {
     /// Serves this machine only, with these frames, to those who watch.
     pub fn local(endpoint: String, port: Option<u16>, token: Token) -> Self {
-        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None, newest: None }
+        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None, newest: None, chart: None }
     }
 }
 
@@ -83,7 +86,7 @@ impl Dashboard {
     /// # Errors
     /// An endpoint or a name of a host that is not accepted, a port in use, or an error of the system.
     pub fn start(settings: DashboardSettings) -> Result<Self, DashboardError> {
-        let DashboardSettings { endpoint, address, port, hosts, token, steer, newest } = settings;
+        let DashboardSettings { endpoint, address, port, hosts, token, steer, newest, chart } = settings;
         let endpoint = match endpoint.as_str() {
             crate::publish::DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|source| DashboardError::Private { source })?,
             _ => endpoint,
@@ -93,7 +96,7 @@ impl Dashboard {
         let address = listener.local_addr()?;
         let access = Access::new(token.clone(), hosts, address)?;
         let (wheel, requests) = Wheel::new(steer);
-        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest)));
+        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest), chart.map(Bytes::from)));
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(2).build()?;
         let listener = {
             let _inside = runtime.enter();

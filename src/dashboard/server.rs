@@ -162,6 +162,14 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
         access.check_token_or_bearer(&parts.uri, &parts.headers)?;
         return Ok(([(CONTENT_TYPE, metrics::MEDIA_TYPE)], hub.metrics()).into_response());
     }
+    if path.ends_with("/chart.svg") {
+        access.check_origin(&parts.headers)?;
+        access.check_token(&parts.uri)?;
+        return Ok(match &hub.chart {
+            Some(chart) => ([(CONTENT_TYPE, "image/svg+xml; charset=utf-8")], chart.clone()).into_response(),
+            None => (StatusCode::NOT_FOUND, "There is no chart of this scene: ridgewatch chart SCENE draws one.\n").into_response(),
+        });
+    }
     if let Some(wanted) = OfFrames::named(path) {
         access.check_origin(&parts.headers)?;
         access.check_token(&parts.uri)?;

@@ -12,8 +12,11 @@ use std::path::Path;
 /// A small double gyre, in seconds instead of minutes.
 const SMALL: [&str; 5] = ["render.width=96", "render.height=48", "time.tau=5", "time.slides=3", "render.samples=2"];
 
+/// The command on a copy of the scene beside `out`, since `chart` leaves a file beside its scene.
 fn command(name: &str, out: &Path, more: &[&str]) -> Vec<String> {
-    let mut arguments: Vec<String> = vec![name.into(), config("double_gyre.toml"), "--device".into(), "cpu".into()];
+    let scene = out.with_file_name("gyre.toml");
+    std::fs::copy(config("double_gyre.toml"), &scene).unwrap();
+    let mut arguments: Vec<String> = vec![name.into(), text(&scene).into(), "--device".into(), "cpu".into()];
     arguments.extend(SMALL.iter().flat_map(|key| ["--set".into(), (*key).to_owned()]));
     arguments.extend(["--out".into(), text(out).into()]);
     arguments.extend(more.iter().map(|word| (*word).to_owned()));
@@ -56,6 +59,8 @@ fn errors_fall_with_steps_and_nodes() {
     let csv = std::fs::read_to_string(out.join("chart.csv")).unwrap();
     assert_eq!(csv.lines().count(), methods.len() + 1);
     assert!(csv.lines().all(|line| columns(line) == 16), "{csv}");
+    // For the dashboard.
+    assert_eq!(std::fs::read(folder.path().join("gyre.chart.svg")).unwrap(), std::fs::read(out.join("chart.svg")).unwrap());
 }
 
 /// Columns of a line of CSV, whose commas inside quotes count as text.
@@ -162,5 +167,5 @@ fn what_cannot_be_charted_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     run(&mut ridgewatch(["chart", config("live.toml").as_str(), "--out", text(folder.path())]))
         .refused(2, &["running simulation", "accepted"]);
-    run(&mut ridgewatch(command("chart", folder.path(), &["--only", "speed"]))).refused(2, &["speed", "ftle"]);
+    run(&mut ridgewatch(command("chart", &folder.path().join("chart"), &["--only", "speed"]))).refused(2, &["speed", "ftle"]);
 }

@@ -59,6 +59,15 @@ impl Stage {
         Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
     }
 
+    /// With a chart.
+    fn charted(chart: &str) -> Self {
+        let (folder, token) = (tempfile::tempdir().unwrap(), Token::random().unwrap());
+        let secret = token.secret().to_owned();
+        let endpoint = format!("ipc://{}", folder.path().join("frames").display());
+        let settings = DashboardSettings { chart: Some(chart.into()), ..DashboardSettings::local(endpoint, Some(0), token) };
+        Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
+    }
+
     fn address(&self) -> SocketAddr {
         self.dashboard.address()
     }
@@ -100,6 +109,20 @@ impl Drop for Publishing {
         self.ends.store(true, Ordering::Relaxed);
         let _ = self.thread.take().map(JoinHandle::join);
     }
+}
+
+#[test]
+fn the_chart_of_the_scene_goes_to_those_who_know_a_token() {
+    let stage = Stage::charted("<svg>speed against accuracy</svg>");
+    assert_eq!(stage.visit().until_state(|_| true)["has_chart"], true);
+    let (status, answer) = get(stage.address(), &format!("/chart.svg?token={}", stage.token), &[]);
+    assert!(status == 200 && answer.contains("content-type: image/svg+xml"), "{answer}");
+    assert!(answer.ends_with("<svg>speed against accuracy</svg>"), "{answer}");
+    assert_eq!(get(stage.address(), "/chart.svg", &[]).0, 403);
+    assert_eq!(get(stage.address(), &format!("/chart.svg?token={}", stage.token), &["Origin: http://elsewhere"]).0, 403);
+    let bare = Stage::new();
+    assert_eq!(bare.visit().until_state(|_| true)["has_chart"], false);
+    assert_eq!(get(bare.address(), &format!("/chart.svg?token={}", bare.token), &[]).0, 404);
 }
 
 #[test]

@@ -9,7 +9,7 @@ import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, asker, download, fieldCommand, histogramAsker, pixelAt, planeAsker } from "./values.js";
+import { Values, address as fileAddress, asker, download, fieldCommand, histogramAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -106,12 +106,24 @@ async function receiveFrame({ sequence, header, payload }, reply) {
   reply(sequence);
 }
 
+/** The chart of speed against accuracy, which is fetched once it is opened. */
+function showChart(exists) {
+  const section = element("accuracy");
+  section.hidden = !exists;
+  const picture = section.querySelector("img");
+  if (exists && !picture.hasAttribute("src")) {
+    picture.loading = "lazy";
+    picture.src = fileAddress("chart.svg", token, {});
+  }
+}
+
 function receiveState(state) {
   server = state;
   steering.receiveState(state);
   values.receiveState(state);
   overlay.receiveState(state);
   histogram.receiveState(state);
+  showChart(state.has_chart === true);
   heard = Number.isFinite(state.seconds_since_message) ? performance.now() - 1000 * state.seconds_since_message : null;
 }
 

@@ -81,7 +81,8 @@ export class Values {
   }
 }
 
-function address(path, token, query) {
+/** Address of what this server keeps. */
+export function address(path, token, query) {
   const url = new URL(path, new URL("./", location.href));
   for (const [name, value] of Object.entries({ token, ...query })) if (value !== null) url.searchParams.set(name, value);
   return url;
