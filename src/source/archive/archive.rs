@@ -415,10 +415,13 @@ impl Archive {
         if high > low { (self.seconds[high] - self.seconds[low]) / (high - low) as f64 } else { 1.0 }
     }
 
+    fn place(&self, index: usize) -> Result<Place, SourceError> {
+        self.places.get(index).copied().ok_or(SourceError::NoSuchSnapshot { index, count: self.places.len() })
+    }
+
     /// Opens the file of a snapshot and returns the place of the snapshot.
     fn open_at(&mut self, index: usize) -> Result<Place, SourceError> {
-        let missing = SourceError::NoSuchSnapshot { index, count: self.places.len() };
-        let place = *self.places.get(index).ok_or(missing)?;
+        let place = self.place(index)?;
         let open = match self.open.take() {
             Some(open) if open.index == place.file => open,
             other => {
@@ -452,13 +455,14 @@ impl Archive {
     /// The components of a snapshot in SI (or unchanged, in cells), the third along the grid's third axis; x fastest; missing values
     /// are NaN. Files that are written to meanwhile are read again.
     fn components(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
-        let group = self.places.get(index).map_or_else(Vec::new, |place| self.files[place.file].group.clone());
+        let file = self.place(index)?.file;
+        let group = self.files[file].group.clone();
         let patience = self.followed.as_ref().map_or(PATIENCE, |followed| followed.longest().max(PATIENCE));
         let begin = Instant::now();
         let mut is_told = false;
         loop {
             let before = match &self.open {
-                Some(open) if self.places[index].file == open.index => open.stamps.clone(),
+                Some(open) if open.index == file => open.stamps.clone(),
                 _ => stamps(&group),
             };
             let read = self.components_once(index);
