@@ -78,10 +78,11 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         ("chart.png", write_png(&chart)?),
         ("chart.json", serde_json::to_vec_pretty(&report)?),
     ];
-    if let Some(path) = chart_beside(&options.paths)
-        && let Err(error) = write_whole(&path, &files[1].1)
-    {
-        messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display()));
+    if let Some(path) = chart_beside(&options.paths).filter(|_| stop.status() == 0) {
+        match write_whole(&path, &files[1].1) {
+            Ok(()) => messages::note(format_args!("the dashboard of this scene shows {}", path.display())),
+            Err(error) => messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display())),
+        }
     }
     for (name, bytes) in files {
         let path = options.out.join(name);

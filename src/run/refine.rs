@@ -48,10 +48,10 @@ impl Frames {
     fn part(self, nodes: usize, per_frame: NodesPerFrame) -> usize {
         let nodes = nodes as f64;
         let pays = 2.0 * nodes <= per_frame.worth * self.expected() as f64;
-        let slides_on = !self.is_only_slide && nodes > per_frame.as_long;
+        let is_too_long = !self.is_only_slide && nodes > per_frame.as_long;
         match (pays, self.shown) {
             (false, _) => 0,
-            (true, 0) if self.left == Some(1) && !slides_on => usize::MAX,
+            (true, 0) if self.left == Some(1) && !is_too_long => usize::MAX,
             (true, 0) => 0,
             (true, _) => (per_frame.worth as usize).max(1),
         }

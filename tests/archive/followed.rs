@@ -122,7 +122,7 @@ fn records_that_are_appended_are_read() {
         let begin = Instant::now();
         loop {
             match netcdf::append(&path) {
-                Err(_) if begin.elapsed() < LONGEST => std::thread::sleep(Duration::from_millis(5)),
+                Err(netcdf::Error::Netcdf(-101)) if begin.elapsed() < LONGEST => std::thread::sleep(Duration::from_millis(5)),
                 file => return file.unwrap(),
             }
         }
@@ -211,9 +211,33 @@ fn a_file_that_changes_while_it_is_open_is_opened_again() {
     let mut archive = open_with(&[&path], "mask = \"none\"");
     assert_eq!(day(&archive.read(1).unwrap()), 2.0);
     // In place, with the data elsewhere.
-    let longer = fixture(&[1.0, 3.0], &["u", "v"]).with("comment", "a longer header").write(&dir.path().join("b"));
-    std::fs::write(&path, std::fs::read(longer).unwrap()).unwrap();
-    assert_eq!(day(&archive.read(1).unwrap()), 3.0);
+    let other = |days: &[f64]| {
+        let longer = fixture(days, &["u", "v"]).with("comment", "a longer header").write(&dir.path().join("b"));
+        std::fs::write(&path, std::fs::read(longer).unwrap()).unwrap();
+    };
+    // With one more time, as a file that grows.
+    other(&[1.0, 2.0, 3.0]);
+    assert_eq!(day(&archive.read(1).unwrap()), 2.0);
+    other(&[1.0, 3.0]);
+    let error = archive.read(1).unwrap_err().to_string();
+    assert!(error.contains("a.nc: its times changed since the archive was opened"), "{error}");
+    assert_eq!(day(&archive.read(0).unwrap()), 1.0);
+}
+
+#[test]
+fn a_file_that_was_locked_when_it_came_is_read_once_it_is_not() {
+    let dir = tempdir().unwrap();
+    put(dir.path(), "a.nc", &fixture_as(NETCDF4, &[1.0, 2.0], &["u", "v"]));
+    let mut reader = followed(dir.path(), "*.nc", LONGEST);
+    assert_eq!(next(&mut reader, 2), [1.0, 2.0]);
+    let part = fixture_as(NETCDF4, &[3.0], &["u", "v"]).write(&dir.path().join("part"));
+    let lock = std::fs::File::open(&part).unwrap();
+    lock.lock().unwrap();
+    std::fs::rename(&part, dir.path().join("b.nc")).unwrap();
+    let warnings = warnings(&reader);
+    assert!(warnings.len() == 1 && warnings[0].contains("not read yet") && warnings[0].contains("cannot be locked"), "{warnings:?}");
+    lock.unlock().unwrap();
+    assert_eq!(next(&mut reader, 1), [3.0]);
 }
 
 #[test]

@@ -32,6 +32,8 @@ pub(super) struct ArchiveFile {
     /// With files of other components, meshes and masks.
     pub(super) group: Group,
     pub(super) frames: Vec<Vec<ComponentPlan>>,
+    /// As the files were before their times were read.
+    pub(super) stamps: Vec<Option<Stamp>>,
 }
 
 /// The file that is open, or files that are read as one.
@@ -78,6 +80,9 @@ pub struct Archive {
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
     pub(super) limits: Limits,
+    pub(super) settings: ArchiveSettings,
+    /// Layout of the first file.
+    pub(super) first: Layout,
     /// Set if further snapshots may come.
     pub(super) followed: Option<Box<Followed>>,
 }
@@ -153,7 +158,7 @@ impl Archive {
             let index = files.len();
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
             entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
-            files.push(ArchiveFile { path: path.clone(), group: group.clone(), frames: layout.frames.clone() });
+            files.push(ArchiveFile { path: path.clone(), group: group.clone(), frames: layout.frames.clone(), stamps: stamps.clone() });
             match &mut first {
                 Some(reference) => {
                     reference.widen(&layout).map_err(|fault| SourceError::file(&path, fault))?;
@@ -190,7 +195,8 @@ impl Archive {
             let accepted = "in metres and seconds: velocities in cells an interval depend on the times that come next";
             return Err(SourceError::setting("follow", "given in the index metric", accepted));
         }
-        let followed = settings.follow.map(|_| Box::new(Followed::new(settings, layout.clone())));
+        let reference = layout.clone();
+        let followed = settings.follow.map(|_| Box::new(Followed::default()));
         let on_sphere = layout.axes[0].kind == Kind::Longitude && layout.axes[1].kind == Kind::Latitude;
         let scale = match (layout.metric, settings.velocity_unit) {
             (Metric::Index, VelocityUnit::Si) => Some(VelocityScale::to_cells(&layout.axes)),
@@ -236,6 +242,8 @@ impl Archive {
             open,
             expected: expected.map(|listing| listing.part(&names)),
             limits,
+            settings: settings.clone(),
+            first: reference,
             files,
             followed,
         };
@@ -415,6 +423,21 @@ impl Archive {
         if high > low { (self.seconds[high] - self.seconds[low]) / (high - low) as f64 } else { 1.0 }
     }
 
+    /// Opens the file of a snapshot, which has changed since its times were read.
+    ///
+    /// # Errors
+    /// The snapshot has another time there now.
+    fn open_changed(&self, index: usize) -> Result<DataFile, SourceError> {
+        let place = self.place(index)?;
+        let group = &self.files[place.file].group;
+        let (file, layout) = open_next(group, &self.settings, Some(&self.first), None, self.limits)?;
+        let entry = layout.time.places.iter().position(|&found| found == (place.frame, place.entry));
+        match entry.and_then(|entry| layout.time.seconds.get(entry)) {
+            Some(&seconds) if seconds == self.seconds[index] => Ok(file),
+            _ => Err(SourceError::file(&group[0], "its times changed since the archive was opened")),
+        }
+    }
+
     fn place(&self, index: usize) -> Result<Place, SourceError> {
         self.places.get(index).copied().ok_or(SourceError::NoSuchSnapshot { index, count: self.places.len() })
     }
@@ -427,18 +450,18 @@ impl Archive {
             other => {
                 // Closed before the next file opens.
                 drop(other);
-                let ArchiveFile { path, group, frames } = &self.files[place.file];
+                let ArchiveFile { path, group, frames, stamps: as_planned } = &self.files[place.file];
                 let stamps = stamps(group);
                 let file = match group.len() {
+                    _ if stamps != *as_planned => self.open_changed(index)?,
                     1 => DataFile::open(path, self.expected.as_ref(), self.limits)?,
                     _ => open_group(group, self.limits)?,
                 };
                 for component in frames.iter().flatten() {
                     let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
-                    // More times may have come to a file that is followed.
-                    let grown = |(k, (now, then)): (usize, (&usize, &usize))| {
-                        now == then || (self.followed.is_some() && component.roles[k] == Role::Time && now > then)
-                    };
+                    // More times may have come.
+                    let grown =
+                        |(k, (now, then)): (usize, (&usize, &usize))| now == then || (component.roles[k] == Role::Time && now > then);
                     let fits =
                         |now: &Vec<usize>| now.len() == component.shape.len() && now.iter().zip(&component.shape).enumerate().all(grown);
                     if !shape.ok().as_ref().is_some_and(fits) {
@@ -457,7 +480,8 @@ impl Archive {
     fn components(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
         let file = self.place(index)?.file;
         let group = self.files[file].group.clone();
-        let patience = self.followed.as_ref().map_or(PATIENCE, |followed| followed.longest().max(PATIENCE));
+        let [least, most] = PATIENCE;
+        let patience = Duration::from_secs_f64(self.settings.follow.unwrap_or_default()).clamp(least, most);
         let begin = Instant::now();
         let mut is_told = false;
         loop {
@@ -467,10 +491,13 @@ impl Archive {
             };
             let read = self.components_once(index);
             // What is read during a write may be of two states of the file.
-            let error = match read {
-                _ if stamps(&group) != before => SourceError::file(&group[0], "it was written to while it was read"),
-                Err(error) if error.is_locked() => error,
-                read => return read,
+            let after = stamps(&group);
+            let changed = group.iter().zip(before.iter().zip(&after)).find(|(_, (before, after))| before != after);
+            let error = match (changed, read) {
+                (Some((path, _)), Err(cause)) => SourceError::file(path, format!("it was written to while it was read ({cause})")),
+                (Some((path, _)), Ok(_)) => SourceError::file(path, "it was written to while it was read"),
+                (None, Err(error)) if error.is_locked() => error,
+                (None, read) => return read,
             };
             self.open = None;
             if begin.elapsed() >= patience {
@@ -629,8 +656,8 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<
     }
 }
 
-/// Least time for which a file that is written to is read again.
-const PATIENCE: Duration = Duration::from_secs(30);
+/// Least and most time for which a file that is written to is read again.
+const PATIENCE: [Duration; 2] = [Duration::from_secs(30), Duration::from_secs(300)];
 /// Time after which the log tells of it.
 const TELL: Duration = Duration::from_secs(5);
 /// Time before a file is read again.

@@ -3,14 +3,13 @@
 use super::archive::{Archive, ArchiveFile, Place, open_next};
 use super::files::expand;
 use super::group::{Group, grouped};
-use crate::archive_settings::ArchiveSettings;
 use crate::error::SourceError;
 use crate::formats::{is_store, is_url};
-use crate::grids::{ComponentPlan, Layout, difference};
+use crate::grids::{ComponentPlan, Layout, TimePlan, difference};
 use crate::snapshots::{News, SnapshotSource};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 /// Looks after which a file that changes at each of them is told.
 const RESTLESS: u32 = 60;
@@ -19,11 +18,9 @@ const RESTLESS: u32 = 60;
 pub(super) type Stamp = (u64, Option<SystemTime>);
 
 /// What is known of the files of an archive that is followed.
+#[derive(Default)]
 pub(super) struct Followed {
     paths: Vec<PathBuf>,
-    settings: ArchiveSettings,
-    /// Layout of the first file.
-    first: Layout,
     /// As the files were when they were read, or refused.
     as_read: HashMap<PathBuf, Stamp>,
     /// As changed files were at the last look, and how many looks in a row they have changed.
@@ -43,11 +40,6 @@ pub(super) fn stamps(group: &Group) -> Vec<Option<Stamp>> {
 }
 
 impl Followed {
-    /// Time to wait for a further snapshot.
-    pub(super) fn longest(&self) -> Duration {
-        Duration::from_secs_f64(self.settings.follow.unwrap_or_default())
-    }
-
     /// Files as they are before they are read.
     ///
     /// # Errors
@@ -58,19 +50,6 @@ impl Followed {
             return Err(SourceError::setting("follow", found, "with files: a store shows no sign that a snapshot is complete"));
         }
         Ok(files.iter().filter_map(|path| Some((path.clone(), stamp(path)?))).collect())
-    }
-
-    /// Of an archive whose first file has the layout `first`.
-    pub(super) fn new(settings: &ArchiveSettings, first: Layout) -> Self {
-        Self {
-            paths: Vec::new(),
-            settings: settings.clone(),
-            first,
-            as_read: HashMap::new(),
-            last_look: HashMap::new(),
-            grouped: HashSet::new(),
-            warned: HashSet::new(),
-        }
     }
 
     /// Looks at these files, folders and patterns, whose files were read as they are in `as_read`.
@@ -145,15 +124,32 @@ impl Archive {
             return;
         }
         let mut planned = Vec::new();
+        let mut tried_again = HashSet::new();
         for group in self.changed_groups(files, &settled, followed, news) {
-            match self.plan_group(&group, followed) {
-                Ok(layout) => planned.push((group.clone(), layout)),
+            let before = stamps(&group);
+            match self.plan_group(&group) {
+                // Someone writes to them again.
+                _ if stamps(&group) != before => {
+                    tried_again.extend(group);
+                    continue;
+                }
+                Ok(layout) => {
+                    let plan = ArchiveFile { path: group[0].clone(), group: group.clone(), frames: layout.frames, stamps: before };
+                    planned.push((plan, layout.time));
+                }
+                // Its lock may end without a change.
+                Err(error) if error.is_locked() => {
+                    followed.warn(news, format!("not read yet: {error}"));
+                    tried_again.extend(group);
+                    continue;
+                }
                 Err(error) => followed.warn(news, format!("not read, until it changes: {error}")),
             }
             followed.mark_read(&group);
         }
         // What waits for a partner is not grouped again until something changes.
-        followed.grouped = settled.into_iter().filter(|path| followed.last_look.contains_key(path)).collect();
+        followed.grouped =
+            settled.into_iter().filter(|path| followed.last_look.contains_key(path) && !tried_again.contains(path)).collect();
         for (path, late) in self.append(planned) {
             followed.warn(news, format!("{}: {late} of its times lie before the newest that was read: they are left out", path.display()));
         }
@@ -165,7 +161,7 @@ impl Archive {
         let all = if self.files.iter().any(|file| file.group.len() > 1) {
             // What is being written may be no file yet.
             let quiet: Vec<PathBuf> = files.iter().filter(|path| quiet(path, followed)).cloned().collect();
-            match grouped(&quiet, &followed.settings) {
+            match grouped(&quiet, &self.settings) {
                 Ok(Some(groups)) => groups,
                 Ok(None) => {
                     let names: Vec<String> = settled.iter().map(|path| path.display().to_string()).collect();
@@ -185,9 +181,9 @@ impl Archive {
         all.into_iter().filter(changed).collect()
     }
 
-    fn plan_group(&self, group: &Group, followed: &Followed) -> Result<Layout, SourceError> {
-        let (_, mut layout) = open_next(group, &followed.settings, Some(&followed.first), None, self.limits)?;
-        if let Some(what) = difference(&followed.first, &layout) {
+    fn plan_group(&self, group: &Group) -> Result<Layout, SourceError> {
+        let (_, mut layout) = open_next(group, &self.settings, Some(&self.first), None, self.limits)?;
+        if let Some(what) = difference(&self.first, &layout) {
             return Err(SourceError::Mixed { first: self.files[0].path.clone(), second: group[0].clone(), what });
         }
         for (component, known) in layout.frames.iter_mut().flat_map(|frame| frame.iter_mut().zip(&self.files[0].frames[0])) {
@@ -197,20 +193,19 @@ impl Archive {
     }
 
     /// Appends the snapshots behind the newest one, in order of time. Returns the new files of which some lie before it, and how many.
-    fn append(&mut self, planned: Vec<(Group, Layout)>) -> Vec<(PathBuf, usize)> {
+    fn append(&mut self, planned: Vec<(ArchiveFile, TimePlan)>) -> Vec<(PathBuf, usize)> {
         let newest = self.seconds.last().copied().unwrap_or(f64::NEG_INFINITY);
         let (mut entries, mut late): (Vec<(f64, Place)>, Vec<_>) = (Vec::new(), Vec::new());
-        for (group, layout) in planned {
-            let own = self.files.iter().position(|file| file.group.first() == group.first());
+        for (plan, time) in planned {
+            let own = self.files.iter().position(|file| file.group.first() == plan.group.first());
             let file = own.unwrap_or(self.files.len());
             let read = self.places.iter().filter(|place| Some(place.file) == own).count();
-            let places = layout.time.places.iter().map(|&(frame, entry)| Place { file, frame, entry });
-            let (old, new): (Vec<_>, Vec<_>) = layout.time.seconds.iter().copied().zip(places).partition(|(seconds, _)| *seconds <= newest);
+            let places = time.places.iter().map(|&(frame, entry)| Place { file, frame, entry });
+            let (old, new): (Vec<_>, Vec<_>) = time.seconds.iter().copied().zip(places).partition(|(seconds, _)| *seconds <= newest);
             if old.len() > read {
-                late.push((group[0].clone(), old.len() - read));
+                late.push((plan.path.clone(), old.len() - read));
             }
             entries.extend(new);
-            let plan = ArchiveFile { path: group[0].clone(), group, frames: layout.frames };
             match own {
                 Some(own) => self.files[own] = plan,
                 None => self.files.push(plan),

@@ -7,7 +7,8 @@ use super::messages::{FormatError, FormatFault};
 use std::cell::Cell;
 use std::ffi::{CString, c_char, c_int};
 use std::fmt::Display;
-use std::fs::TryLockError;
+use std::fs::{File, Metadata, TryLockError};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -71,15 +72,30 @@ pub unsafe fn read_without_locks() {
     }
 }
 
-/// True if Linux lists a lock for writing on this file. Asking for the lock instead could make the writer's own attempt fail.
+/// True if Linux lists a lock of another process for writing on this file. It lists none of processes of other machines, or outside of the container.
+/// Asking for the lock instead could make the writer's own attempt fail.
 fn is_locked_for_writing(path: &Path) -> bool {
-    let (Ok(file), Ok(locks)) = (path.metadata(), std::fs::read_to_string("/proc/locks")) else { return false };
-    let place = format!("{:02x}:{:02x}:{}", libc::major(file.dev()), libc::minor(file.dev()), file.ino());
+    let (Some(place), Ok(locks)) = (place_of_locks(path), std::fs::read_to_string("/proc/locks")) else { return false };
+    let own = std::process::id().to_string();
     // Number, kind, "ADVISORY", "WRITE" or "READ", process, place, first and last byte.
-    locks
-        .lines()
-        .map(|line| line.split_whitespace().collect::<Vec<_>>())
-        .any(|lock| lock.get(3) == Some(&"WRITE") && lock.get(5) == Some(&&*place))
+    locks.lines().map(|line| line.split_whitespace().collect::<Vec<_>>()).any(|lock| match lock[..] {
+        [_, "FLOCK" | "POSIX" | "OFDLCK", _, "WRITE", process, at, ..] => at == place && process != own,
+        _ => false,
+    })
+}
+
+/// Device and inode of a file as `/proc/locks` has them. The device is that of its mount: btrfs gives files another one.
+fn place_of_locks(path: &Path) -> Option<String> {
+    let inode = path.metadata().ok().filter(Metadata::is_file)?.ino();
+    let file = File::open(path).ok()?;
+    let about = std::fs::read_to_string(format!("/proc/self/fdinfo/{}", file.as_raw_fd())).ok()?;
+    let mount = about.lines().find_map(|line| line.strip_prefix("mnt_id:"))?.trim();
+    let mounts = std::fs::read_to_string("/proc/self/mountinfo").ok()?;
+    // Number of the mount, that of the one that it is in, device.
+    let mut fields = mounts.lines().map(str::split_whitespace).find(|fields| fields.clone().next() == Some(mount))?;
+    let (major, minor) = fields.nth(2)?.split_once(':')?;
+    let [major, minor] = [major, minor].map(|number| number.parse::<u32>());
+    Some(format!("{:02x}:{:02x}:{inode}", major.ok()?, minor.ok()?))
 }
 
 /// Checks whether a file failed to open because it could not be locked, which the libraries do not say.
@@ -88,7 +104,7 @@ fn locked(path: &Path, what: &str) -> Option<FormatError> {
     if std::env::var_os(FILE_LOCKING).is_some_and(|value| value == "FALSE" || value == "0") {
         return None;
     }
-    let why = match std::fs::File::open(path).ok()?.try_lock_shared() {
+    let why = match File::open(path).ok()?.try_lock_shared() {
         Ok(()) => return None,
         Err(TryLockError::WouldBlock) => WRITTEN.to_owned(),
         Err(TryLockError::Error(error)) => format!("its file system says {error}"),

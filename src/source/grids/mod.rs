@@ -45,4 +45,5 @@ pub use mask::{Masks, NO_MASK, ZERO, holds_mask};
 pub use plan::{plan, readable_axes};
 pub use poles::Poles;
 pub use refine::ResamplingError;
+pub use times::TimePlan;
 pub use velocity_units::VelocityScale;

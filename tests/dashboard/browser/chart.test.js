@@ -29,6 +29,7 @@ test("a scene with a chart shows it, and one without does not", async () => {
   copyFileSync(path.join(REPOSITORY, "configs/double_gyre.toml"), scene);
   const bare = await startShown(folder, { scene });
   const without = await open(bare.url, "light");
+  await until("a state", async () => /at ipc/.test(await without.textContent("#about")));
   assert.ok(!(await without.isVisible("#accuracy")));
   assert.deepEqual(complaints, []);
   await without.context().close();
@@ -39,6 +40,7 @@ test("a scene with a chart shows it, and one without does not", async () => {
   const page = await open(charted.url, "dark");
   await until("the chart", () => page.isVisible("#accuracy summary"));
   const width = () => page.evaluate(() => document.querySelector("#accuracy img").naturalWidth);
+  assert.equal(await width(), 0, "not fetched yet");
   await page.click("#accuracy summary");
   await until("its picture", async () => (await width()) === 40);
   assert.deepEqual(complaints, []);
