@@ -1,6 +1,6 @@
 //! `ridgewatch chart`: speed against accuracy of a scene, and the pick.
 
-use super::common::{Common, Interrupted, Usage, chart_beside, device, located, print_json, print_text, scene, seconds};
+use super::common::{CHART, Common, Interrupted, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
@@ -78,7 +78,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         ("chart.png", write_png(&chart)?),
         ("chart.json", serde_json::to_vec_pretty(&report)?),
     ];
-    if let Some(path) = chart_beside(&options.paths).filter(|_| stop.status() == 0) {
+    if let Some(path) = beside_scene(&options.paths, CHART).filter(|_| stop.status() == 0) {
         match write_whole(&path, &files[1].1) {
             Ok(()) => messages::note(format_args!("the dashboard of this scene shows {}", path.display())),
             Err(error) => messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display())),

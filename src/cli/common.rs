@@ -98,10 +98,13 @@ pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
     Ok(scene)
 }
 
-/// Where `chart` leaves the chart of a scene file for the dashboard.
-pub fn chart_beside(paths: &[PathBuf]) -> Option<PathBuf> {
+/// Ending of the chart that `chart` leaves beside a scene file for the dashboard.
+pub const CHART: &str = "chart.svg";
+
+/// A file beside a scene file, with its name and another ending; `None` for data files.
+pub fn beside_scene(paths: &[PathBuf], ending: &str) -> Option<PathBuf> {
     match paths {
-        [one] if is_config(one) => Some(one.with_extension("chart.svg")),
+        [one] if is_config(one) => Some(one.with_extension(ending)),
         _ => None,
     }
 }
@@ -130,11 +133,8 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
         expand(&scene.archive.files).map_err(|error| located(scene, RunError::from(error), RunError::refused))?
     };
     let data: Vec<_> = files.iter().filter_map(|file| std::fs::metadata(file).ok().filter(std::fs::Metadata::is_file)).collect();
-    let remembered = match paths {
-        // A folder does not tell of changes inside.
-        [one] if is_config(one) && data.len() == files.len() => Some(one.with_extension("auto.json")),
-        _ => None,
-    };
+    // A folder does not tell of changes inside.
+    let remembered = beside_scene(paths, "auto.json").filter(|_| data.len() == files.len());
     let data: Vec<_> = files.iter().zip(&data).map(|(file, found)| (file, found.len(), found.modified().ok())).collect();
     let version = env!("CARGO_PKG_VERSION");
     let asked = format!("{version} {} {} threads {data:?} {}", device_name(device), common.threads, scene.to_toml()?);

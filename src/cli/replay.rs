@@ -1,6 +1,6 @@
 //! `ridgewatch replay`.
 
-use super::common::{Common, chart_beside, device, open_by, scene, seconds, settle_method};
+use super::common::{CHART, Common, beside_scene, device, open_by, scene, seconds, settle_method};
 use super::session::{RunArguments, Session};
 use anyhow::Result;
 use ridgewatch::run::Setup;
@@ -31,7 +31,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let device = device(common, &scene)?;
     let method = settle_method(common, &mut scene, &options.paths, &device)?;
     let text = scene.to_toml()?;
-    let chart = chart_beside(&options.paths);
+    let chart = beside_scene(&options.paths, CHART);
     Session { common, options: &options.run, scene, text, follows: None, chart }.run(|scene, _| {
         let mut setup = open_by(scene, Setup::following)?;
         setup.decisions.extend(method);

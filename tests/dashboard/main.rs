@@ -52,19 +52,18 @@ impl Stage {
 
     /// With the connection file of a command socket, or the newest frame of a run.
     fn with(folder: TempDir, steer: Option<PathBuf>, newest: Option<Arc<NewestFrame>>) -> Self {
+        Self::start(folder, |settings| DashboardSettings { steer, newest, ..settings })
+    }
+
+    fn charted(chart: &str) -> Self {
+        Self::start(tempfile::tempdir().unwrap(), |settings| DashboardSettings { chart: Some(chart.into()), ..settings })
+    }
+
+    fn start(folder: TempDir, change: impl FnOnce(DashboardSettings) -> DashboardSettings) -> Self {
         let token = Token::random().unwrap();
         let secret = token.secret().to_owned();
         let endpoint = format!("ipc://{}", folder.path().join("frames").display());
-        let settings = DashboardSettings { steer, newest, ..DashboardSettings::local(endpoint, Some(0), token) };
-        Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
-    }
-
-    /// With a chart.
-    fn charted(chart: &str) -> Self {
-        let (folder, token) = (tempfile::tempdir().unwrap(), Token::random().unwrap());
-        let secret = token.secret().to_owned();
-        let endpoint = format!("ipc://{}", folder.path().join("frames").display());
-        let settings = DashboardSettings { chart: Some(chart.into()), ..DashboardSettings::local(endpoint, Some(0), token) };
+        let settings = change(DashboardSettings::local(endpoint, Some(0), token));
         Self { folder, dashboard: Dashboard::start(settings).unwrap(), token: secret }
     }
 
