@@ -187,7 +187,7 @@ deny: $(CARGO_DENY)/bin/cargo-deny
 
 .venv/installed: Makefile | python-packages
 	$(PYTHON) -m venv .venv
-	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq xarray zarr anywidget
+	.venv/bin/pip install --quiet numpy scipy netCDF4 pyproj pyzmq xarray zarr anywidget
 	touch $@
 
 $(NVRTC)/done: | python-packages

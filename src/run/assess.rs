@@ -14,6 +14,9 @@ use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::{Audited, Gate, REJECTED, Residual, Strata};
 use std::sync::atomic::Ordering;
 
+/// Audit points in the trusted region below which a warning tells what they may miss.
+const FEW_POINTS: u64 = 100;
+
 /// A rendered and audited frame whose results have not taken effect.
 pub(super) struct Work<S> {
     pub(super) rendered: Rendered<S>,
@@ -95,6 +98,17 @@ impl Run<'_> {
                     "the error where the surrogate is trusted was above `trust.tolerance` over the last frames (evidence {evidence:.0}, limit {REJECTED}): every cell must earn trust again"
                 ));
             }
+        }
+        let few = trusted.filter(|error| matches!(self.render.method, Method::Gated | Method::Surrogate) && error.points < FEW_POINTS);
+        if let Some(TrustedError { points, .. }) = few
+            && !std::mem::replace(&mut self.progress.has_warned_of_few_points, true)
+        {
+            // A share of the points that all miss it with a probability of 5 % (rule of three).
+            let unseen = 100.0 * 3.0 / points as f64;
+            record.warnings.push(format!(
+                "the stated error rests on {points} audit points: where up to {unseen:.0} % of the trusted region errs more, they may miss it; \
+                 trust.audit_min_per_cell and trust.audit_share draw more"
+            ));
         }
         learning.trust.decay();
         learning.trust.observe(Some(audited), &rendered);

@@ -208,6 +208,8 @@ pub(super) struct RunProgress {
     pub(super) preparation_traces: u64,
     /// True once the warning about short particle lifetimes was given.
     pub(super) has_warned_of_deaths: bool,
+    /// True once the warning about few audit points was given.
+    pub(super) has_warned_of_few_points: bool,
     pub(super) warnings: Vec<String>,
     /// Optimizer steps of the surrogate that the accumulating picture shows.
     pub(super) steps_shown: u64,

@@ -10,7 +10,9 @@ use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetti
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
-use crate::source::{DEFAULT_READ_AHEAD, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, window_snapshots};
+use crate::source::{
+    DEFAULT_READ_AHEAD, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, duration, window_snapshots,
+};
 use crate::surrogate::Kind;
 use crate::surrogate::network::Input;
 
@@ -185,9 +187,9 @@ impl Setup {
             let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes, followed)).is_ok();
             let (tau, why) = default_tau(&mut **source, &map, fits)?;
             let unit = source.describe().time_unit;
-            let words = if unit == "s" { in_words(tau) } else { String::new() };
-            notes.push(format!("time.tau is not given: {tau} {unit}{words}, {why}"));
-            decisions.push(Decision::new("time.tau", format_args!("{tau} {unit}{words}"), why));
+            let words = duration(tau, &unit);
+            notes.push(format!("time.tau is not given: {words}, {why}"));
+            decisions.push(Decision::new("time.tau", words, why));
             (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
         }
         let tau = map.tau;
@@ -212,17 +214,6 @@ impl Setup {
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
         Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes, decisions })
-    }
-}
-
-/// Seconds in hours or days, if they are many.
-fn in_words(seconds: f64) -> String {
-    const HOUR: f64 = 3600.0;
-    const DAY: f64 = 24.0 * HOUR;
-    match seconds {
-        _ if seconds < 2.0 * HOUR => String::new(),
-        _ if seconds < 2.0 * DAY => format!(" ({:.1} hours)", seconds / HOUR),
-        _ => format!(" ({:.1} days)", seconds / DAY),
     }
 }
 

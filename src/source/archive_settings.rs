@@ -180,8 +180,8 @@ pub struct ArchiveSettings {
     pub staggering: Staggering,
     /// Curvilinear longitudes and latitudes: spacing in degrees of the resampled grid; by default chosen by its error.
     pub resolution: Option<[f64; 2]>,
-    /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
-    /// decided by their standard names.
+    /// Curvilinear longitudes and latitudes, projections, rotated poles: whether velocities run along the grid's own directions, not east and
+    /// north; by default decided by their standard names.
     pub grid_relative: Option<bool>,
     /// Mask of land: a variable (0 is land unless its attributes say otherwise; `!NAME`: 0 is water), `"zero"` (nodes whose velocity is 0 at
     /// all sampled times) or `"none"`; by default found by convention.

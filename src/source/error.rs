@@ -91,16 +91,16 @@ pub enum SourceError {
     TooShort {
         /// The archive.
         source_name: String,
-        /// |tau| in time units.
-        tau: f64,
+        /// |tau| with its unit.
+        tau: String,
         /// Snapshots needed at the archive's median interval.
         needed: usize,
         /// Number of snapshots.
         found: usize,
         /// Median interval.
-        interval: f64,
+        interval: String,
         /// Span of the archive.
-        span: f64,
+        span: String,
     },
     /// An index beyond the last snapshot.
     #[error("snapshot {index} was asked for, but there are {count} (counted from 0)")]

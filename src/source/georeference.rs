@@ -90,7 +90,7 @@ pub struct Positions {
     x: Vec<f64>,
     y: Vec<f64>,
     /// Longitude and latitude, x fastest.
-    degrees: Vec<[f64; 2]>,
+    pub(crate) degrees: Vec<[f64; 2]>,
 }
 
 impl Coordinate {
@@ -171,6 +171,29 @@ impl Coordinate {
     }
 }
 
+impl GridMapping {
+    /// First number of an attribute.
+    pub(crate) fn number(&self, name: &str) -> Option<f64> {
+        self.numbers(name).first().copied()
+    }
+
+    /// Numbers of an attribute.
+    pub(crate) fn numbers(&self, name: &str) -> &[f64] {
+        match self.attributes.iter().find(|(n, _)| n == name) {
+            Some((_, MappingValue::Numbers(numbers))) => numbers,
+            _ => &[],
+        }
+    }
+
+    /// Name of the projection by the CF conventions.
+    pub(crate) fn kind(&self) -> &str {
+        match self.attributes.iter().find(|(n, _)| n == "grid_mapping_name") {
+            Some((_, MappingValue::Text(text))) => text,
+            _ => "",
+        }
+    }
+}
+
 impl Positions {
     /// Longitude and latitude at a place between the nodes, bilinear; `None` beyond them, or where they are unknown. Longitudes may jump by 360
     /// degrees between nodes.
@@ -187,10 +210,14 @@ impl Positions {
         (sum[0].is_finite() && sum[1].is_finite()).then_some(sum)
     }
 
-    /// Of a file whose axes are x and y of a projection, and whose longitudes and latitudes have both dimensions.
-    fn of(file: &DataFile, layout: &Layout) -> Option<Self> {
+    /// Of a file whose axes are x and y of a projection or about a rotated pole, and whose longitudes and latitudes have both dimensions.
+    pub(crate) fn of(file: &DataFile, layout: &Layout) -> Option<Self> {
         let listing = &file.listing;
         let component = &layout.frames[0].first()?;
+        // Nodes between the points of the file are none of these.
+        if component.own.iter().any(Option::is_some) {
+            return None;
+        }
         let velocity = &listing.variables[listing.find(&component.name)?];
         let (&dx, &dy) = (velocity.dimensions.last()?, velocity.dimensions.iter().rev().nth(1)?);
         let find = |kind: Kind| {
@@ -253,11 +280,7 @@ impl Georeference {
             new.mapping = in_file.or((layout.metric == Metric::Sphere).then(own));
             return new;
         }
-        // A false easting counts in the unit of the coordinates, which became metres.
-        let metres = |plan: &AxisPlan| {
-            plan.in_file.as_ref().is_some_and(|i| Unit::parse(&i.units).is_some_and(|u| u.is_length() && u.factor == 1.0))
-        };
-        new.mapping = in_file.filter(|_| layout.axes[..2].iter().all(metres));
+        new.mapping = in_file.filter(|_| is_in_metres(layout));
         if new.mapping.is_some() {
             for (axis, name) in new.axes.iter_mut().zip(["projection_x_coordinate", "projection_y_coordinate"]) {
                 axis.standard_name = Some(name.into());
@@ -273,9 +296,16 @@ impl Georeference {
     }
 }
 
+/// True if x and y are metres in the file: a false easting counts in the unit of the coordinates.
+pub(crate) fn is_in_metres(layout: &Layout) -> bool {
+    layout.axes[..2]
+        .iter()
+        .all(|plan| plan.in_file.as_ref().is_some_and(|i| Unit::parse(&i.units).is_some_and(|u| u.is_length() && u.factor == 1.0)))
+}
+
 /// The grid mapping of the velocity, if the CF conventions know it. A universal transverse Mercator projection that is given in the words of PROJ is
 /// put into theirs.
-fn mapping(file: &DataFile, layout: &Layout) -> Option<GridMapping> {
+pub(crate) fn mapping(file: &DataFile, layout: &Layout) -> Option<GridMapping> {
     let listing = &file.listing;
     let velocity = &listing.variables[listing.find(&layout.frames[0].first()?.name)?];
     // The extended form names coordinates behind a colon.

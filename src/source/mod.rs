@@ -18,7 +18,9 @@ mod error;
 mod formats;
 mod georeference;
 mod grids;
+mod ground;
 pub mod live;
+mod projection;
 mod snapshots;
 mod source_settings;
 
@@ -32,5 +34,5 @@ pub use error::SourceError;
 pub use formats::{FormatError, FormatFault, hdf5_version, is_url, netcdf_version, read_without_locks, report_crashes};
 pub use georeference::{Coordinate, Georeference, GridMapping, MappingValue, Positions};
 pub use grids::{FileOrder, InFile};
-pub use snapshots::{Listener, News, SnapshotSource, SourceDescription, StillReading, TimeGap, window_snapshots};
+pub use snapshots::{Listener, News, SnapshotSource, SourceDescription, StillReading, TimeGap, duration, window_snapshots};
 pub use source_settings::{DomainSettings, SourceKind, SourceSettings};

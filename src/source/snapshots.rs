@@ -60,7 +60,7 @@ pub trait SnapshotSource: Send {
         let (span, interval) = self.span_and_interval()?;
         let found = self.times().len();
         if found < 2 {
-            return Err(SourceError::TooShort { source_name: self.name(), tau: interval, needed: 2, found, interval, span });
+            return Err(self.too_short(interval, 2));
         }
         Ok((span / 2.0).max(2.0 * interval).min(span))
     }
@@ -85,7 +85,14 @@ pub trait SnapshotSource: Send {
             return Ok(());
         }
         let needed = if interval > 0.0 { ((tau / interval * (1.0 - 1e-9)).ceil() as usize).saturating_add(1) } else { 2 };
-        Err(SourceError::TooShort { source_name: self.name(), tau, needed: needed.max(found + 1), found, interval, span })
+        Err(self.too_short(tau, needed.max(found + 1)))
+    }
+
+    /// The error about an archive that is shorter than `tau`, for which it needs so many snapshots.
+    fn too_short(&self, tau: f64, needed: usize) -> SourceError {
+        let (times, unit) = (self.times(), self.describe().time_unit);
+        let [tau, interval, span] = [tau, median_interval(times), span(times)].map(|value| duration(value, &unit));
+        SourceError::TooShort { source_name: self.name(), tau, needed, found: times.len(), interval, span }
     }
 
     /// Span of the times and their median interval.
@@ -97,6 +104,17 @@ pub trait SnapshotSource: Send {
             [time] => Err(SourceError::OneTime { source_name: self.name(), time: self.show(*time) }),
             times => Ok((span(times), median_interval(times))),
         }
+    }
+}
+
+/// A duration with its unit; seconds also in hours or days, if they are many.
+pub fn duration(value: f64, unit: &str) -> String {
+    const HOUR: f64 = 3600.0;
+    const DAY: f64 = 24.0 * HOUR;
+    match value {
+        _ if unit != "s" || value < 2.0 * HOUR => format!("{value} {unit}"),
+        _ if value < 2.0 * DAY => format!("{value} s ({:.1} hours)", value / HOUR),
+        _ => format!("{value} s ({:.1} days)", value / DAY),
     }
 }
 

@@ -13,6 +13,7 @@ mod kit;
 mod land;
 mod netcdf;
 mod odd;
+mod own_axes;
 mod parts;
 mod real;
 mod refined;
@@ -20,6 +21,7 @@ mod refused;
 mod resampled;
 mod round_trip;
 mod terrain;
+mod turned;
 mod unstructured;
 mod zarr;
 

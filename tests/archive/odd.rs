@@ -191,13 +191,13 @@ fn coordinates_that_are_all_zero_are_passed_over() {
 fn coordinates_of_two_dimensions_are_named() {
     let dir = tempdir().unwrap();
     // Those of other points come first in the file, and nothing says which belong to the velocity.
-    let file = coordinates(ocean(), ["TLON", "TLAT"], ["y", "x"], NX, NY, |x, y| place(x as f64, y as f64));
-    let file = coordinates(file, ["ULON", "ULAT"], ["y", "x"], NX, NY, |x, y| place(x as f64 + 0.5, y as f64 + 0.5));
+    let file = coordinates(ocean(), ["ALON", "ALAT"], ["y", "x"], NX, NY, |x, y| place(x as f64, y as f64));
+    let file = coordinates(file, ["BLON", "BLAT"], ["y", "x"], NX, NY, |x, y| place(x as f64 + 0.5, y as f64 + 0.5));
     let file = uniform(file).write(&dir.path().join("pop.nc"));
     let first = |toml: &str| open_with(&[&file], toml).grid().axes[0].first();
     assert!((first("") - place(0.0, 0.0)[0]).abs() < 1e-9);
-    assert!((first("x = \"ULON\"\ny = \"ULAT\"") - place(0.5, 0.5)[0]).abs() < 1e-9);
-    refused(&[&file], "x = \"ULON\"", &["`ULON`", "name both", "--set archive.y="]);
+    assert!((first("x = \"BLON\"\ny = \"BLAT\"") - place(0.5, 0.5)[0]).abs() < 1e-9);
+    refused(&[&file], "x = \"BLON\"", &["`BLON`", "name both", "--set archive.y="]);
 }
 
 #[test]
@@ -228,4 +228,61 @@ fn a_link_that_leads_nowhere_is_told() {
     std::os::unix::fs::symlink("nowhere", others).unwrap();
     std::fs::remove_file(dir.path().join("b.nc")).unwrap();
     assert_eq!(open(&[dir.path()]).times().len(), 1, "a link that is no data file does not matter");
+}
+
+/// Idealised models write longitudes in metres, or x and y of two dimensions, on meshes that are rectangles.
+#[test]
+fn coordinates_of_two_dimensions_in_metres_are_cartesian() {
+    let dir = tempdir().unwrap();
+    let mesh = |names: [&str; 2], unit: Option<&str>, tilt: f64| {
+        let mut fixture = Fixture::new(CLASSIC, &[("time", 2), ("y", 3), ("x", 3)]).axis("time", HOURS, &[0.0, 1.0]);
+        for (k, name) in names.into_iter().enumerate() {
+            let at = |i: usize| 500.0 * if k == 0 { (i % 3) as f64 + tilt * (i / 3) as f64 } else { (i / 3) as f64 };
+            fixture = fixture.variable(name, &["y", "x"], f32s((0..9).map(at).collect()));
+            fixture = unit.into_iter().fold(fixture, |fixture, unit| fixture.with("units", unit));
+        }
+        fixture
+    };
+    for (number, (names, unit)) in
+        [(["nav_lon", "nav_lat"], Some("m")), (["x_rho", "y_rho"], Some("meter")), (["x_rho", "y_rho"], None)].into_iter().enumerate()
+    {
+        let mut archive = open(&[winds(mesh(names, unit, 0.0), 2).write(&dir.path().join(format!("{number}.nc")))]);
+        assert!(matches!(archive.grid().geometry, Geometry::Cartesian));
+        assert_eq!(archive.grid().axes[1].coordinates(), [0.0, 500.0, 1000.0]);
+        assert_eq!(us(&archive.read(1).unwrap())[1], 10.0);
+    }
+    let degrees = winds(mesh(["nav_lon", "nav_lat"], Some("degrees"), 0.0), 2).write(&dir.path().join("degrees.nc"));
+    refused(&[&degrees], "", &["a latitude is 500 degrees", "--set archive.units.x=m --set archive.units.y=m"]);
+    let stated = open_with(&[&degrees], "[units]\nx = \"m\"\ny = \"m\"");
+    assert_eq!(stated.grid().axes[0].coordinates(), [0.0, 500.0, 1000.0]);
+    let tilted = winds(mesh(["x_rho", "y_rho"], None, 0.3), 2).write(&dir.path().join("tilted.nc"));
+    refused(&[&tilted], "", &["dimension `x` has no coordinate variable"]);
+}
+
+/// POP: both components lie on the corners of the cells, without an attribute that says so.
+#[test]
+fn coordinates_are_those_whose_names_are_of_the_component() {
+    let dir = tempdir().unwrap();
+    let mut fixture = Fixture::new(CLASSIC, &[("time", 2), ("nlat", 8), ("nlon", 8)]).axis("time", HOURS, &[0.0, 1.0]);
+    for (name, unit, shift) in
+        [("TLONG", "degrees_east", 0.0), ("TLAT", "degrees_north", 0.0), ("ULONG", "degrees_east", 0.5), ("ULAT", "degrees_north", 0.5)]
+    {
+        let at = |i: usize| if unit == "degrees_east" { 10.0 + (i % 8) as f64 } else { 20.0 + (i / 8) as f64 } + shift;
+        fixture = fixture.variable(name, &["nlat", "nlon"], f32s((0..64).map(at).collect())).with("units", unit);
+    }
+    let fixture = fixture.fields("m/s", ["UVEL", "VVEL"].map(|name| (name, f32s(vec![0.25; 128]))));
+    let archive = open(&[fixture.write(&dir.path().join("pop.nc"))]);
+    let grid = archive.grid();
+    assert_eq!((grid.axes[0].first(), grid.axes[1].first()), (10.5, 20.5), "{}", notes(&archive));
+    assert!(notes(&archive).contains("`ULONG` and `ULAT`"), "{}", notes(&archive));
+}
+
+#[test]
+fn levels_without_a_vertical_velocity_suggest_one_of_them() {
+    let dir = tempdir().unwrap();
+    let axes: [(&str, &str, &[f64]); 4] =
+        [("time", HOURS, &[0.0, 1.0]), ("depth", "m", &[0.5, 10.0, 30.0]), ("y", "m", &X), ("x", "m", &X)];
+    let archive = open(&[winds(Fixture::on(CLASSIC, &axes), 6).write(&dir.path().join("levels.nc"))]);
+    let said = notes(&archive);
+    assert!(said.contains("mostly the shear between them; one level alone is read with --set archive.level=0.5"), "{said}");
 }

@@ -222,7 +222,9 @@ fn tau_against_the_archive() {
     let day = 86_400.0;
     assert_eq!(archive.longest_default_tau().unwrap(), 5.0 * day);
     assert!(archive.check_tau(10.0 * day).is_ok());
-    assert!(matches!(archive.check_tau(10.5 * day), Err(SourceError::TooShort { needed: 12, found: 11, .. })));
+    let error = archive.check_tau(10.5 * day).unwrap_err();
+    assert!(matches!(error, SourceError::TooShort { needed: 12, found: 11, .. }));
+    assert!(error.to_string().contains("tau = 907200 s (10.5 days) needs 12 snapshots 86400 s (24.0 hours) apart"), "{error}");
     let message = archive.check_tau(30.0 * day).unwrap_err().to_string();
     assert!(message.contains("needs 31 snapshots") && message.contains("long.nc has 11"), "{message}");
     assert!(archive.check_tau(0.0).is_err() && archive.check_tau(f64::NAN).is_err());

@@ -11,6 +11,7 @@ import sys
 
 import netCDF4
 import numpy as np
+import pyproj
 from scipy.integrate import solve_ivp
 
 EPOCH = "seconds since 1970-01-01"
@@ -84,7 +85,19 @@ class Era5:
         factor = (-7000.0 / pressure[up])[:, None, None]
         read = lambda name: np.stack([filled(d[name][0])[up] for d in sets])
         # (component, time, z, y, x)
-        self.v = np.stack([read("u"), read("v"), read("w") * factor[None]])
+        east, north = read("u"), read("v")
+        (xe, xn), (ye, yn) = self.plane(*np.meshgrid(self.x, self.y))
+        self.v = np.stack([xe * east + xn * north, ye * east + yn * north, read("w") * factor[None]])
+
+    @staticmethod
+    def plane(x, y):
+        """Metres along x and y of UTM zone 32 for a metre on the ground to the east and to the north, by geodesics of 10 m."""
+        ellipsoid = pyproj.Geod(ellps="GRS80")
+        utm = pyproj.Proj("+proj=utm +zone=32 +ellps=GRS80")
+        lon, lat = utm(x, y, inverse=True)
+        ends = lambda azimuth: np.array(utm(*ellipsoid.fwd(lon, lat, np.full_like(lon, azimuth), np.full_like(lon, 10.0))[:2]))
+        along = [(ends(azimuth) - ends(azimuth + 180.0)) / 20.0 for azimuth in (90.0, 0.0)]
+        return (along[0][0], along[1][0]), (along[0][1], along[1][1])
 
     def at(self, place, t):
         found = [cell(a, q) for a, q in zip((self.z, self.y, self.x, self.time), (place[2], place[1], place[0], t))]

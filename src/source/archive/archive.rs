@@ -17,6 +17,7 @@ use crate::grids::{
     AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, Role, VelocityScale, ZERO,
     difference, holds_mask, plan, read_component, read_levels, slab_of,
 };
+use crate::ground::GroundToGrid;
 use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
@@ -72,6 +73,7 @@ pub struct Archive {
     vertical: Vec<f64>,
     poles: Poles,
     resampling: Option<Resampling>,
+    ground_to_grid: Option<GroundToGrid>,
     metric: Metric,
     in_cells: bool,
     georeference: Georeference,
@@ -138,6 +140,7 @@ impl Archive {
         let mut expected: Option<Listing> = None;
         let mut synthetic = None;
         let mut georeference = Georeference::default();
+        let (mut ground_to_grid, mut ground_note) = (None, None);
         let mut masks: Vec<Group> = Vec::new();
         for group in groups {
             let Some(path) = group.first().cloned() else { continue };
@@ -150,7 +153,7 @@ impl Archive {
                 }
                 Err(error) => return Err(error),
             };
-            let own_levels = layout.frames.iter().flatten().all(|component| component.columns.is_none());
+            let own_levels = layout.frames.iter().flatten().all(|component| !component.is_interpolated());
             if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && own_levels && file.listing.format == Format::NetCdf4
             {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
@@ -173,6 +176,7 @@ impl Archive {
                     }
                     format = file.listing.format;
                     georeference = Georeference::of(&file, &layout, settings);
+                    (ground_to_grid, ground_note) = GroundToGrid::of(&file, &layout, settings)?.unzip();
                     first = Some(layout);
                 }
             }
@@ -190,7 +194,7 @@ impl Archive {
             Metric::Index => (0..seconds.len()).map(|i| i as f64).collect(),
             Metric::Sphere | Metric::Cartesian => seconds.clone(),
         };
-        check_fit(settings, &layout, format)?;
+        check_fit(settings, &layout, ground_note.is_some(), format)?;
         if settings.follow.is_some() && layout.metric == Metric::Index {
             let accepted = "in metres and seconds: velocities in cells an interval depend on the times that come next";
             return Err(SourceError::setting("follow", "given in the index metric", accepted));
@@ -228,6 +232,7 @@ impl Archive {
             places: entries.iter().map(|e| e.1).collect(),
             vertical: layout.vertical,
             poles: layout.poles,
+            ground_to_grid: ground_to_grid.flatten(),
             resampling: layout.resampling,
             seconds,
             times,
@@ -257,6 +262,7 @@ impl Archive {
             archive.description.notes.push(format!("no velocities, but a mask of land: {}{more}", in_words(first)));
         }
         archive.description.notes.extend(land.notes);
+        archive.description.notes.extend(ground_note);
         match settings.mask.as_deref() {
             Some(ZERO) => archive.mask_zeros()?,
             None if land.found.iter().all(Option::is_none) && !staggered => archive.tell_zeros(),
@@ -328,8 +334,9 @@ impl Archive {
     /// Tells of cells whose corners are 0 at all sampled times, in the middle one of the levels: probably land.
     fn tell_zeros(&mut self) {
         let level = self.axes.get(2).map_or(0, |axis| axis.order[axis.order.len() / 2]);
-        // Nodes of a resampled mesh are no entries of the file, whose components may differ in shape.
-        let region = self.resampling.is_none().then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
+        // Nodes between the points of the file are no entries, and its components may differ in shape.
+        let own_nodes = self.resampling.is_none() && self.files[0].frames[0].iter().all(|plan| plan.own.iter().all(Option::is_none));
+        let region = own_nodes.then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
         let points = |plan: &ComponentPlan| {
             let [x, y] = region.clone().unwrap_or_else(|| [0, 1].map(|k| (0..plan.along(k)).collect()));
             [x, y, vec![level.min(plan.along(2) - 1)]]
@@ -522,6 +529,9 @@ impl Archive {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
             None => plans.iter().map(|plan| read_levels(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
         };
+        if let Some(ground_to_grid) = &self.ground_to_grid {
+            ground_to_grid.apply(&mut components);
+        }
         if !self.vertical.is_empty()
             && let Some(w) = components.get_mut(2)
         {
@@ -560,6 +570,11 @@ impl Archive {
             self.resampling = Some(Resampling::Curvilinear(refined));
         }
         Ok(())
+    }
+
+    /// True if nodes of the grid are no points of a component.
+    pub(super) fn is_interpolated(&self) -> bool {
+        self.files[0].frames[0].iter().any(ComponentPlan::is_interpolated)
     }
 
     /// Description of the resampling, if any, and a warning if `error` is large.
@@ -676,7 +691,7 @@ fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), Sou
     let on_grid = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
     // Columns are read whole.
     let whole = |c: &ComponentPlan| [0, 1, 2].iter().fold(1u64, |n, &k| n.saturating_mul(c.along(k) as u64));
-    let in_file = layout.frames[0].iter().filter(|c| c.columns.is_some()).map(whole).max().unwrap_or(0);
+    let in_file = layout.frames[0].iter().filter(|c| c.is_interpolated()).map(whole).max().unwrap_or(0);
     let nodes = on_grid.max(in_file);
     let what = limits.check(nodes.saturating_mul(NODE_BYTES), &format!("snapshots of {nodes} nodes"));
     what.map_err(|what| SourceError::file(path, what))

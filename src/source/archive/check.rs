@@ -55,11 +55,11 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
     Ok(())
 }
 
-/// Refuses settings that have no effect on files of this kind.
+/// Refuses settings that have no effect on files of this kind. `from_ground` tells whether it matters which way velocities run.
 ///
 /// # Errors
 /// The setting at fault.
-pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) -> Result<(), SourceError> {
+pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, from_ground: bool, format: Format) -> Result<(), SourceError> {
     let s = settings;
     let hdf5 = !format.names_dimensions();
     let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
@@ -72,6 +72,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         () => format.name(),
     };
     let terrain = staggered || layout.frames[0].iter().any(|component| component.columns.is_some());
+    let own_axes = layout.frames[0].iter().any(|component| component.own.iter().any(Option::is_some));
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
         ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
@@ -80,7 +81,12 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
         ("time_step", s.time_step.is_some(), hdf5, "with HDF5 only; the times of NetCDF are in the file"),
         ("heights", s.heights.is_some(), terrain, "with levels that follow the terrain or the bottom of the sea only"),
-        ("staggering", s.staggering != Staggering::default(), staggered, "with WRF output only"),
+        (
+            "staggering",
+            s.staggering != Staggering::default(),
+            staggered || own_axes,
+            "with components that have own coordinates, as in WRF output, only",
+        ),
         ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
@@ -88,8 +94,8 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         (
             "grid_relative",
             s.grid_relative.is_some(),
-            curvilinear,
-            "with longitudes and latitudes of two dimensions and unstructured meshes only",
+            curvilinear || from_ground,
+            "with projections, rotated poles, longitudes and latitudes of two dimensions, and unstructured meshes only",
         ),
         ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
         ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),

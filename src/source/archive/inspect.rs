@@ -40,8 +40,10 @@ pub struct Inspection {
     pub axes: Vec<AxisReport>,
     /// Times.
     pub time: Option<TimeReport>,
-    /// Resampling; `None` if the nodes are the file's own.
+    /// Resampling to other longitudes and latitudes, or of WRF output.
     pub resampling: Option<ResamplingReport>,
+    /// True if a component is interpolated from its own points along an axis, or between levels that follow the bottom.
+    pub interpolated: bool,
     /// Missing values.
     pub missing: Option<MissingReport>,
     /// Resolution in time.
@@ -175,6 +177,7 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
         axes: Vec::new(),
         time: None,
         resampling: None,
+        interpolated: false,
         missing: None,
         resolution: None,
     };
@@ -248,6 +251,7 @@ impl Inspection {
             self.axes.push(AxisReport::of(plan, role));
         }
         let error = archive.resampling_error()?;
+        self.interpolated = archive.is_interpolated();
         self.resampling = error.and_then(|error| {
             let (what, warning) = archive.resampled(&error)?;
             let ResamplingError { at_points, between, velocity } = error;
@@ -405,6 +409,7 @@ impl fmt::Display for Inspection {
                 writeln!(f, "\n  {}", r.what)?;
                 r.warning.iter().try_for_each(|warning| writeln!(f, "  {warning}"))?;
             }
+            None if self.interpolated => writeln!(f, "\nresampling\n  each component is interpolated from its own points: see the notes")?,
             None => writeln!(f, "\nresampling\n  none: nodes are the file's own")?,
         }
         if let Some(m) = &self.missing {

@@ -75,12 +75,13 @@ pub fn classify_name(name: &str) -> Kind {
         | "glamf" | "lonc" | "clon" | "loncell" => Kind::Longitude,
         "lat" | "latitude" | "latitudes" | "lats" | "nav_lat" | "rlat" | "xlat" | "grid_latitude" | "gphit" | "gphiu" | "gphiv"
         | "gphif" | "latc" | "clat" | "latcell" => Kind::Latitude,
-        "x" | "xc" | "nx" | "easting" | "west_east" | "xu_ocean" | "xt_ocean" | "xcoor" | "x_coordinate" => Kind::X,
-        "y" | "yc" | "ny" | "northing" | "south_north" | "yu_ocean" | "yt_ocean" | "ycoor" | "y_coordinate" => Kind::Y,
+        "x" | "xc" | "nx" | "easting" | "west_east" | "xu_ocean" | "xt_ocean" | "xcoor" | "x_coordinate" | "x_rho" | "x_u" | "x_v"
+        | "xg" | "xp1" | "xf" | "xq" | "xh" | "x_faa" | "x_caa" => Kind::X,
+        "y" | "yc" | "ny" | "northing" | "south_north" | "yu_ocean" | "yt_ocean" | "ycoor" | "y_coordinate" | "y_rho" | "y_u" | "y_v"
+        | "yg" | "yp1" | "yf" | "yq" | "yh" | "y_afa" | "y_aca" => Kind::Y,
         "z" | "zc" | "nz" | "nz1" | "lev" | "level" | "levels" | "plev" | "pressure" | "pressure_level" | "isobaric" | "depth"
-        | "deptht" | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor" => {
-            Kind::Level
-        }
+        | "deptht" | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor"
+        | "zl" | "zu" | "zp1" | "zf" | "z_aaf" | "z_aac" | "sw_ocean" => Kind::Level,
         "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" | "month" | "months" => Kind::Time,
         _ => Kind::Unknown,
     }

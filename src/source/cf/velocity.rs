@@ -146,6 +146,19 @@ pub fn named(variable: &Variable) -> Option<Component> {
     by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable)).map(|(component, ..)| component)
 }
 
+/// The reason for which a name says that a component runs east; `None` if none does.
+pub fn says_eastward(u: &Variable) -> Option<String> {
+    let standard = u.text("standard_name").unwrap_or_default();
+    let long = u.text("long_name").unwrap_or_default().to_ascii_lowercase();
+    // `grid_eastward_wind` runs along the grid.
+    let says = |text: &str| (text.contains("eastward") || text.contains("zonal")) && !text.starts_with("grid");
+    match () {
+        () if says(standard) => Some(format!("standard_name `{standard}`")),
+        () if standard.is_empty() && says(&long) => Some(format!("long_name `{long}`")),
+        () => None,
+    }
+}
+
 type Named = (Component, usize, usize, String);
 
 fn by_standard_name(variable: &Variable) -> Option<Named> {

@@ -454,6 +454,7 @@ impl Planner<'_> {
             of_water: false,
             mask: None,
             columns: None,
+            own: Default::default(),
         })
     }
 }

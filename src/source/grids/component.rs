@@ -3,6 +3,7 @@
 use super::axes::runs;
 use super::column::Columns;
 use super::land::Mask;
+use super::own_axes::{OwnAxis, read_interpolated};
 use crate::cf::packing::Packing;
 use crate::error::SourceError;
 use crate::formats::DataFile;
@@ -37,6 +38,8 @@ pub struct ComponentPlan {
     pub mask: Option<Arc<Mask>>,
     /// Levels that follow the bottom, and the heights that they are interpolated to.
     pub columns: Option<Arc<Columns>>,
+    /// Coordinates of its own along x, y and z, where those of the other components differ.
+    pub own: [Option<Arc<OwnAxis>>; 3],
 }
 
 impl ComponentPlan {
@@ -47,7 +50,16 @@ impl ComponentPlan {
 
     /// Levels that [`read_levels`] counts.
     pub fn levels(&self) -> usize {
-        self.columns.as_ref().map_or_else(|| self.along(2), |columns| columns.heights.len())
+        match (&self.columns, &self.own[2]) {
+            (Some(columns), _) => columns.heights.len(),
+            (None, Some(own)) => own.nodes(),
+            (None, None) => self.along(2),
+        }
+    }
+
+    /// True if nodes of the grid are no points of the component.
+    pub fn is_interpolated(&self) -> bool {
+        self.columns.is_some() || self.own.iter().any(Option::is_some)
     }
 
     /// All entries in the order of the file.
@@ -118,14 +130,15 @@ pub fn read_component(file: &DataFile, component: &ComponentPlan, orders: &Order
     Ok(values)
 }
 
-/// The same with `orders[2]` along the levels of the grid: heights if the levels of the file follow the bottom, else entries of the file.
+/// The same with `orders` along the grid: heights if the levels of the file follow the bottom, nodes along axes on which the component has own
+/// coordinates, else entries of the file.
 ///
 /// # Errors
 /// The values cannot be read.
 pub fn read_levels(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
     match &component.columns {
         Some(columns) => columns.read(file, component, orders, entry),
-        None => read_component(file, component, orders, entry),
+        None => read_interpolated(file, component, orders, entry),
     }
 }
 

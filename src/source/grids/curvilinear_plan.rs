@@ -12,7 +12,7 @@ use super::refine::Choice;
 use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
-use crate::cf::velocity::{Candidate, Velocity};
+use crate::cf::velocity::{Candidate, Velocity, says_eastward};
 use crate::error::SourceError;
 use crate::formats::Variable;
 use std::sync::Arc;
@@ -127,11 +127,17 @@ impl Planner<'_> {
         let first: Vec<&str> = of.text("coordinates").map(|t| t.split_whitespace().collect()).unwrap_or_default();
         let find = |kind: Kind| {
             let fits = |v: &Variable| v.dimensions.len() >= 2 && v.number.is_number() && classify(v) == kind;
-            let mut found: Vec<usize> = listing.matching(fits).collect();
+            // Longitudes in metres are those of an idealised model.
+            let mut found: Vec<usize> = listing.matching(fits).filter(|&i| !self.is_in_metres(kind, i)).collect();
             // In files that were joined, each component has coordinates of its own file, or of its points in a mesh.
             found.sort_by_key(|&i| {
                 let ((part, name), of_part) = (self.file.origin(i), self.file.origin(variable).0);
-                (part != of_part, !first.contains(&name), !name.to_ascii_lowercase().ends_with(letter))
+                let name_of = |letter: &str| {
+                    let name = name.to_ascii_lowercase();
+                    name.starts_with(letter) || name.ends_with(letter)
+                };
+                // On Arakawa's B grid, v lies where u does.
+                (part != of_part, !first.contains(&name), !name_of(letter), letter != "v" || !name_of("u"))
             });
             found
         };
@@ -211,7 +217,10 @@ impl Planner<'_> {
     /// Refuses latitudes beyond the poles.
     pub fn check_latitudes(&self, variable: usize, latitudes: &[f64]) -> Result<(), SourceError> {
         match latitudes.iter().find(|l| l.abs() > 90.001) {
-            Some(odd) => Err(self.misfit(variable, format!("a latitude is {odd} degrees; accepted are -90 to 90, and missing values"))),
+            Some(odd) => {
+                let hint = "if the coordinates are metres, write --set archive.units.x=m --set archive.units.y=m";
+                Err(self.misfit(variable, format!("a latitude is {odd} degrees; accepted are -90 to 90, and missing values; {hint}")))
+            }
             None => Ok(()),
         }
     }
@@ -268,15 +277,12 @@ impl Planner<'_> {
     fn runs_along_grid(&self, u: usize, cells: Cells) -> (bool, String) {
         let variable = self.variable(u);
         let standard = variable.text("standard_name").unwrap_or_default();
-        let says = |text: &str| text.contains("eastward") || text.contains("zonal");
-        let long = variable.text("long_name").unwrap_or_default().to_ascii_lowercase();
-        match self.settings.grid_relative {
-            Some(along) => (along, "as set".into()),
-            None if cells != Cells::Rows => (false, "the mesh has no rows".into()),
-            None if says(standard) => (false, format!("standard_name `{standard}`")),
-            None if standard.is_empty() && says(&long) => (false, format!("long_name `{long}`")),
-            None if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
-            None => (true, "no name says eastward; --set archive.grid_relative=false otherwise".into()),
+        match (self.settings.grid_relative, says_eastward(variable)) {
+            (Some(along), _) => (along, "as set".into()),
+            (None, _) if cells != Cells::Rows => (false, "the mesh has no rows".into()),
+            (None, Some(why)) => (false, why),
+            (None, None) if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
+            (None, None) => (true, "no name says eastward; --set archive.grid_relative=false otherwise".into()),
         }
     }
 
@@ -309,10 +315,20 @@ impl Planner<'_> {
                         archive.level=VALUE, or by its entry with --set archive.select.DIMENSION=0";
             return Err(self.misfit(u, what));
         }
-        let level_axis = match &terrain {
+        let mut level_axis = match &terrain {
             Some(terrain) => self.height_axis(terrain)?,
             None => level_extent.map(|e| self.axis(u, e, 2)).transpose()?,
         };
+        let mut own_levels = Vec::new();
+        if let (Some(w), Some(extent), true, None) = (&velocity.w, level_extent, three, &terrain) {
+            let dims = self.variable(w.variable).dimensions.iter().map(|&d| self.measured(d));
+            if let Some(of_w) = dims.filter(|e| e.kind == Kind::Level).find(|e| self.listing().dimensions[e.dimension].len > 1) {
+                // u and v have the same levels.
+                let along = [(u, *extent), (u, *extent), (w.variable, of_w)];
+                let (axis, own) = self.axis_of_all(&along, 2)?;
+                (level_axis, own_levels) = (Some(axis), own);
+            }
+        }
 
         let role = |which: usize, d: usize| match (planes[which].iter().position(|&t| t == d), level) {
             (Some(k), _) => Role::Axis(k),
@@ -337,10 +353,11 @@ impl Planner<'_> {
         let w = self.vertical_candidate(velocity, terrain.as_ref());
         let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three, terrain.as_ref())?;
         match w {
-            Some(w) if terrain.is_some() || w.along(2) == levels[0] => components.push(w),
+            Some(w) if terrain.is_some() || w.along(2) == levels[0] || !own_levels.is_empty() => components.push(w),
             Some(w) => self.note(format!("`{}` lies on other levels than u: vertical motion is taken as 0", w.name)),
             None => {}
         }
+        components.iter_mut().zip(own_levels).for_each(|(component, own)| component.own[2] = Some(own));
         self.give_columns(&mut components, terrain.as_ref())?;
 
         let points = &points[..components.len()];

@@ -12,7 +12,7 @@ const MAX_COORDINATES: usize = 1 << 26;
 const MAX_NODES: usize = 1 << 24;
 
 /// A dimension, what it measures and its coordinate variable.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq)]
 pub struct Extent {
     pub dimension: usize,
     pub kind: Kind,

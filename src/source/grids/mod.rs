@@ -5,7 +5,8 @@
 //! files that name their dimensions from files that do not.
 //!
 //! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan` (also of unstructured meshes, whose points `unstructured_plan`
-//! finds and `triangles` connects), `staggered_plan` (WRF) and `datasets` (no named dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation), and `refine` chooses
+//! finds and `triangles` connects), `staggered_plan` (WRF) and `datasets` (no named dimensions). Two of them share `column` (levels that follow the bottom of the sea; WRF uses its interpolation) and `own_axes` (components on
+//! coordinates of their own), and `refine` chooses
 //! how fine the grid of `curvilinear_plan` is.
 
 mod axes;
@@ -23,6 +24,7 @@ mod levels;
 mod locator;
 mod mask;
 mod nest;
+mod own_axes;
 mod plan;
 mod planner;
 mod poles;

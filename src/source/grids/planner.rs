@@ -162,10 +162,6 @@ impl<'a> Planner<'a> {
             poles = Poles::close(&longitude[0], &mut rest[0]).map_err(|fault| self.fault(fault))?;
         }
         self.notes.extend(axes.iter().flat_map(|axis| axis.notes.iter().cloned()));
-        let geographic = |v: &Variable| v.text("standard_name").is_some_and(|n| n == "eastward_wind" || n.starts_with("eastward_sea"));
-        if (axes[0].kind, axes[1].kind) == (Kind::X, Kind::Y) && self.listing().variables.iter().any(geographic) {
-            self.note("eastward and northward velocities are taken along x and y of the projection: its grid convergence is not applied");
-        }
         Ok((vertical, poles))
     }
 
@@ -198,6 +194,7 @@ impl<'a> Planner<'a> {
             of_water: is_of_water(self.listing(), variable),
             mask: None,
             columns: None,
+            own: Default::default(),
         })
     }
 
@@ -236,6 +233,19 @@ impl<'a> Planner<'a> {
         }
     }
 
+    /// Tells of levels without a vertical velocity. The level that is suggested is that nearest to the surface.
+    fn note_no_vertical(&mut self, levels: Option<&AxisPlan>) {
+        let level = levels.map(|levels| match &levels.in_file {
+            Some(ends) if ends.last.abs() < ends.first.abs() => ends.last,
+            Some(ends) => ends.first,
+            None => levels.axis.last(),
+        });
+        let way = level.map_or_else(String::new, |level| format!("; one level alone is read with --set archive.level={level}"));
+        self.note(format!(
+            "no vertical velocity found: it is taken as 0, and where levels move apart the FTLE is mostly the shear between them{way}"
+        ));
+    }
+
     /// The third component, if it exists and is wanted. Levels that follow the ground take changes of pressure as well.
     pub fn vertical_component(
         &mut self,
@@ -255,7 +265,7 @@ impl<'a> Planner<'a> {
                 self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));
             }
             (None, true) if self.settings.w.as_deref() == Some("none") => self.note("vertical motion is ignored, as set"),
-            (None, true) => self.note("no vertical velocity found: it is taken as 0"),
+            (None, true) => self.note_no_vertical(axis),
             (None, false) => {}
         }
         Ok(None)

@@ -1,12 +1,13 @@
-//! Files whose components share one grid of coordinates in rows.
+//! Files whose components have coordinates of one dimension.
 
 use super::axes::{AxisPlan, Coordinates, Quantity};
 use super::column_plan::Terrain;
 use super::component::Role;
 use super::dimensions::Extent;
 use super::layout::Layout;
+use super::own_axes::{OwnAxis, shared};
 use super::planner::Planner;
-use crate::archive_settings::{Metric, VelocityUnit};
+use crate::archive_settings::{Metric, Staggering, VelocityUnit};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
 use crate::cf::velocity::{self, Candidate, Component, Velocity};
@@ -14,6 +15,17 @@ use crate::error::SourceError;
 use crate::formats::{UNREADABLE, Variable};
 use ridgewatch_base::setting::word;
 use ridgewatch_field::{Axis, AxisFault};
+use std::sync::Arc;
+
+/// Axis of the grid along which a coordinate runs.
+fn place(kind: Kind) -> Option<usize> {
+    match kind {
+        Kind::Longitude | Kind::X => Some(0),
+        Kind::Latitude | Kind::Y => Some(1),
+        Kind::Level => Some(2),
+        Kind::Time | Kind::Unknown => None,
+    }
+}
 
 impl Planner<'_> {
     /// Finds the components of the velocity.
@@ -52,78 +64,198 @@ impl Planner<'_> {
         Ok(())
     }
 
-    /// Plans a file whose components lie on the same points.
+    /// Plans a file whose components have coordinates of one dimension, the same ones or their own.
     pub fn plan_rectilinear(mut self, velocity: &Velocity, first: Option<&Layout>) -> Result<Layout, SourceError> {
         let u = velocity.u.variable;
         let mut extents = self.extents(u)?;
         let terrain = self.terrain(velocity, &mut extents, first)?;
         let w = self.vertical_candidate(velocity, terrain.as_ref());
-        self.check_same_points(velocity, w, terrain.as_ref())?;
+        if terrain.is_some() {
+            self.check_same_points(velocity, w, terrain.as_ref())?;
+        }
         self.name_by_position(u, &mut extents)?;
         let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
 
-        let mut axes = Vec::new();
-        let mut roles: Vec<(usize, Role)> = Vec::new();
-        let place = |kind: Kind| match kind {
-            Kind::Longitude | Kind::X => Some(0),
-            Kind::Latitude | Kind::Y => Some(1),
-            Kind::Level => Some(2),
-            _ => None,
-        };
         extents.sort_by_key(|e| place(e.kind).unwrap_or(3));
         let levels = extents.iter().any(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
         let three = terrain.as_ref().map_or(levels, Terrain::is_three);
         let metric = self.metric(&extents, three, terrain.is_some())?;
-        for extent in &extents {
-            let role = match (place(extent.kind), level) {
-                (_, Some((dimension, index))) if dimension == extent.dimension => Role::Fixed(index),
-                (Some(k), _) => Role::Axis(k),
-                (None, _) => Role::Time,
-            };
-            match (role, &terrain) {
+        let w_in_use = w.filter(|_| three);
+        let candidates: Vec<&Candidate> = [Some(&velocity.u), Some(&velocity.v), w_in_use].into_iter().flatten().collect();
+        let mut own = vec![extents.clone(); candidates.len()];
+        if terrain.is_none() {
+            for (which, candidate) in candidates.iter().enumerate().skip(1) {
+                let extents = self.own_extents(candidate.variable, &extents).filter(|own| metric != Metric::Index || *own == extents);
+                own[which] = extents.ok_or_else(|| self.apart(u, candidate.variable))?;
+            }
+        }
+
+        let mut axes = Vec::new();
+        let mut places: Vec<[Option<Arc<OwnAxis>>; 3]> = vec![Default::default(); candidates.len()];
+        let role = |extent: &Extent| match (place(extent.kind), level) {
+            (_, Some((dimension, index))) if dimension == extent.dimension => Role::Fixed(index),
+            (Some(k), _) => Role::Axis(k),
+            (None, _) => Role::Time,
+        };
+        for (n, extent) in extents.iter().enumerate() {
+            match (role(extent), &terrain) {
                 (Role::Axis(2), Some(terrain)) => axes.extend(self.height_axis(terrain)?),
-                (Role::Axis(k), _) => axes.push(self.axis(u, extent, k)?),
+                (Role::Axis(k), _) => {
+                    let along: Vec<(usize, Extent)> = candidates.iter().zip(&own).map(|(c, own)| (c.variable, own[n])).collect();
+                    let (axis, own) = self.axis_of_all(&along, k)?;
+                    places.iter_mut().zip(own).for_each(|(places, own)| places[k] = Some(own));
+                    axes.push(axis);
+                }
                 _ => {}
             }
-            roles.push((extent.dimension, role));
         }
+        let mut roles: Vec<Vec<(usize, Role)>> =
+            own.iter().map(|extents| extents.iter().map(|extent| (extent.dimension, role(extent))).collect()).collect();
         // w may lie between the levels of u.
-        if let (Some(terrain), Some(w)) = (&terrain, w) {
+        if let (Some(terrain), Some(w), Some(roles)) = (&terrain, w_in_use, roles.get_mut(2)) {
             let own = self.variable(w.variable).dimensions.iter().filter(|&&d| terrain.is_along(2, d));
             roles.extend(own.map(|&d| (d, Role::Axis(2))));
         }
         let mut components =
-            vec![self.component(&velocity.u, &roles, Some(&axes[0]))?, self.component(&velocity.v, &roles, Some(&axes[1]))?];
-        components.extend(self.vertical_component(w, &roles, axes.get(2), three, terrain.as_ref())?);
+            vec![self.component(&velocity.u, &roles[0], Some(&axes[0]))?, self.component(&velocity.v, &roles[1], Some(&axes[1]))?];
+        let of_w = roles.get(2).map_or(&[][..], Vec::as_slice);
+        components.extend(self.vertical_component(w, of_w, axes.get(2), three, terrain.as_ref())?);
+        components.iter_mut().zip(places).for_each(|(component, own)| component.own = own);
         self.give_columns(&mut components, terrain.as_ref())?;
         let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: None, notes: self.notes })
     }
 
+    /// Extents of another component in the order of those of u, which differ in their horizontal dimensions and levels at most. `None` if they differ in more.
+    fn own_extents(&self, variable: usize, extents: &[Extent]) -> Option<Vec<Extent>> {
+        let dims = &self.variable(variable).dimensions;
+        let known = |d: usize| extents.iter().find(|e| e.dimension == d).copied();
+        let wide = |d: usize| {
+            known(d).is_some()
+                || (self.listing().dimensions[d].len > 1 && self.settings.entry(&self.listing().dimensions[d].name).is_none())
+        };
+        let mut own: Vec<Extent> =
+            dims.iter().copied().filter(|&d| wide(d)).map(|d| known(d).unwrap_or_else(|| self.measured(d))).collect();
+        // As for u: x last, y before it, then levels.
+        let kinds = extents.iter().map(|e| e.kind);
+        let mut missing: Vec<Kind> = kinds.filter(|&kind| own.iter().all(|own| place(own.kind) != place(kind))).collect();
+        missing.sort_by_key(|&kind| place(kind));
+        let unknown: Vec<&mut Extent> = own.iter_mut().rev().filter(|own| own.kind == Kind::Unknown).collect();
+        if unknown.len() == missing.len() {
+            unknown.into_iter().zip(missing).for_each(|(own, kind)| own.kind = kind);
+        }
+        let of = |extent: &Extent| {
+            let mut found = own.iter().filter(|own| place(own.kind) == place(extent.kind));
+            let one = found.next().filter(|_| found.next().is_none())?;
+            (place(extent.kind).is_some() || one.dimension == extent.dimension).then_some(Extent { kind: extent.kind, ..*one })
+        };
+        let found: Option<Vec<Extent>> = extents.iter().map(of).collect();
+        found.filter(|found| found.len() == own.len())
+    }
+
+    /// Axis `k` of the grid, which components with dimensions `along` share, and the places of its nodes among their own coordinates, if these differ.
+    pub fn axis_of_all(&mut self, along: &[(usize, Extent)], k: usize) -> Result<(AxisPlan, Vec<Arc<OwnAxis>>), SourceError> {
+        let (u, first) = along[0];
+        let other = along.iter().find(|(_, extent)| extent.dimension != first.dimension);
+        if let (Some(&(other, _)), true) = (other, k < 2) {
+            for (_, extent) in along {
+                if extent.coordinate.is_none() && self.separable(extent.dimension, k)?.is_none() {
+                    return Err(self.apart(u, other));
+                }
+            }
+        }
+        let base = self.axis(u, &first, k)?;
+        if other.is_none() {
+            return Ok((base, Vec::new()));
+        }
+        let mut plans = vec![base];
+        for &(variable, extent) in &along[1..] {
+            let plan = match extent.dimension == first.dimension {
+                true => plans[0].clone(),
+                false if k == 2 => self.own_levels(variable, &extent, &plans[0])?,
+                false => self.axis(variable, &extent, k)?,
+            };
+            if plan.quantity != plans[0].quantity {
+                let [a, b] = [&plan, &plans[0]].map(|plan| format!("`{}` ({})", plan.axis.name(), plan.axis.units()));
+                return Err(self.misfit(variable, format!("its coordinate {a} measures another quantity than {b} of u")));
+            }
+            plans.push(plan);
+        }
+        // On Arakawa's C grid, v lies between the faces of x.
+        let centred = usize::from(k == 0);
+        let Some((axis, own)) = shared(&plans, centred, self.settings.staggering).map_err(|fault| self.fault(fault))? else {
+            return Ok((plans.swap_remove(0), Vec::new()));
+        };
+        let mut names: Vec<String> = plans.iter().map(|plan| format!("`{}`", plan.axis.name())).collect();
+        names.dedup();
+        let (names, nodes) = (names.join(", "), axis.axis.len());
+        self.note(match self.settings.staggering {
+            Staggering::Faces => format!(
+                "the components have own coordinates along {}: {names}; read on the {nodes} of all, between which each is interpolated linearly from its own \
+                 points (--set archive.staggering=centres takes fewer, and smooths)",
+                ["x", "y", "z"][k]
+            ),
+            Staggering::Centres => format!(
+                "the components have own coordinates along {}: {names}; interpolated to the {nodes} of `{}`, as set",
+                ["x", "y", "z"][k],
+                axis.axis.name()
+            ),
+        });
+        Ok((axis, own))
+    }
+
+    /// Levels of another component than u. Those without coordinates are taken for the levels of u if they are as many.
+    fn own_levels(&mut self, variable: usize, extent: &Extent, of_u: &AxisPlan) -> Result<AxisPlan, SourceError> {
+        let found = extent.coordinate.map(|_| self.axis(variable, extent, 2)).transpose()?;
+        let count = self.listing().dimensions[extent.dimension].len;
+        let name = &self.variable(variable).name;
+        match found {
+            Some(own) if own.quantity == of_u.quantity => Ok(own),
+            _ if count == of_u.order.len() => {
+                let [own, levels] = [&self.listing().dimensions[extent.dimension].name, of_u.axis.name()];
+                self.note(format!("`{name}`: nothing tells where the levels `{own}` lie: taken as those of `{levels}`"));
+                Ok(of_u.clone())
+            }
+            _ => {
+                let dimension = &self.listing().dimensions[extent.dimension].name;
+                let what = format!(
+                    "nothing tells where its {count} levels `{dimension}` lie beside the {} of `{}`; leave vertical motion out with --set \
+                     archive.w=none",
+                    of_u.order.len(),
+                    of_u.axis.name()
+                );
+                Err(self.misfit(variable, what))
+            }
+        }
+    }
+
     fn check_same_points(&self, found: &Velocity, w: Option<&Candidate>, terrain: Option<&Terrain>) -> Result<(), SourceError> {
-        let listing = self.listing();
         let but_levels = |which: usize, variable: usize| {
             let dims = &self.variable(variable).dimensions;
             dims.iter().copied().filter(|&d| terrain.is_none_or(|t| !t.is_along(which, d))).collect::<Vec<_>>()
         };
         let u = found.u.variable;
-        let differs = |&(which, other): &(usize, usize)| match terrain {
-            Some(_) => but_levels(which, other) != but_levels(0, u),
-            None => !velocity::same_dimensions(listing, u, other),
-        };
         let others = [Some((1, found.v.variable)), w.map(|w| (2, w.variable))];
-        let Some((_, other)) = others.into_iter().flatten().find(differs) else { return Ok(()) };
-        let [a, b] = [found.u.variable, other].map(|i| self.variable(i));
-        Err(self.fault(format!(
-            "`{}` lies on ({}) but `{}` on ({}): staggered components are read only if they are WRF's (dimensions `..._stag`, with PH and \
-             PHB) or have longitudes and latitudes of two dimensions, their own or of the points between which they lie; those are named with \
-             --set archive.x=NAME --set archive.y=NAME",
+        match others.into_iter().flatten().find(|&(which, other)| but_levels(which, other) != but_levels(0, u)) {
+            Some((_, other)) => Err(self.apart(u, other)),
+            None => Ok(()),
+        }
+    }
+
+    /// Error about components on points that are not understood together.
+    fn apart(&self, u: usize, other: usize) -> SourceError {
+        let listing = self.listing();
+        let [a, b] = [u, other].map(|i| self.variable(i));
+        self.fault(format!(
+            "`{}` lies on ({}) but `{}` on ({}): staggered components are read if each has coordinates of its own along x, y and z, if they are WRF's \
+             (dimensions `..._stag`, with PH and PHB), or if they have longitudes and latitudes of two dimensions, their own or of the points between \
+             which they lie; those are named with --set archive.x=NAME --set archive.y=NAME",
             a.name,
             listing.dimension_names(a),
             b.name,
             listing.dimension_names(b)
-        )))
+        ))
     }
 
     /// The metric in force; `three` says whether the flow has three dimensions, `in_metres` that its levels are heights whatever the file calls them.
@@ -165,7 +297,11 @@ impl Planner<'_> {
             return Err(self.fault(AxisFault::TooShort { name: name.clone(), found: len }));
         }
         let range = self.settings.region.and_then(|r| [Some([r[0], r[1]]), Some([r[2], r[3]]), None][k]);
-        let Some(coordinate) = extent.coordinate else {
+        let (coordinate, values) = if let Some(coordinate) = extent.coordinate {
+            (coordinate, self.coordinate_values(coordinate)?)
+        } else if let Some(found) = self.separable(extent.dimension, k)? {
+            found
+        } else {
             if self.settings.velocity_unit != VelocityUnit::Cells {
                 return Err(self.misfit(u, self.without_coordinates(extent.dimension)));
             }
@@ -173,10 +309,57 @@ impl Planner<'_> {
             let notes = vec![format!("`{name}` has no coordinates: counted from 0")];
             return Ok(AxisPlan { notes, ..AxisPlan::made(extent.kind, axis, Quantity::None) });
         };
-        let values = self.coordinate_values(coordinate)?;
         let units = self.axis_units(extent.kind, coordinate);
         let coordinates = Coordinates { units, ..Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values) };
         coordinates.plan(range, self.wants_periodic())
+    }
+
+    /// A coordinate of two dimensions in metres that varies along `dimension` only, and its values there: of idealised models, whose meshes are rectangles.
+    fn separable(&self, dimension: usize, k: usize) -> Result<Option<(usize, Vec<f64>)>, SourceError> {
+        let listing = self.listing();
+        let kinds = [[Kind::X, Kind::Longitude], [Kind::Y, Kind::Latitude]];
+        let Some(kinds) = kinds.get(k) else { return Ok(None) };
+        let fits = |v: &Variable| {
+            v.dimensions.len() >= 2
+                && v.dimensions.last_chunk::<2>().is_some_and(|plane| plane.contains(&dimension))
+                && v.number.is_number()
+        };
+        for index in listing.matching(fits).collect::<Vec<_>>() {
+            let kind = classify(self.variable(index));
+            if !kinds.contains(&kind) || !self.is_in_metres(kind, index) {
+                continue;
+            }
+            let shape = self.shape(index);
+            let [rows, width] = [shape[shape.len() - 2], shape[shape.len() - 1]];
+            listing.check_count(self.variable(index), &[rows, width])?;
+            let plane = self.plane(index)?;
+            let is_row = self.variable(index).dimensions.last() == Some(&dimension);
+            let values: Vec<f64> = if is_row { plane[..width].to_vec() } else { plane.iter().step_by(width).copied().collect() };
+            let range = values.iter().fold(0.0f64, |m, v| m.max((v - values[0]).abs()));
+            let is_alike = |(i, v): (usize, &f64)| (v - values[if is_row { i % width } else { i / width }]).abs() <= 1e-6 * range;
+            if range > 0.0 && plane.iter().enumerate().all(is_alike) {
+                return Ok(Some((index, values)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// True if a coordinate is in metres: by its unit, or by its name if it has none.
+    pub fn is_in_metres(&self, kind: Kind, index: usize) -> bool {
+        match self.axis_units(kind, index).and_then(Unit::parse) {
+            Some(unit) if unit.is_length() => true,
+            Some(unit) => unit.is_dimensionless() && matches!(kind, Kind::X | Kind::Y),
+            None => self.axis_units(kind, index).is_none() && matches!(kind, Kind::X | Kind::Y),
+        }
+    }
+
+    /// Values of a coordinate along its last two dimensions.
+    fn plane(&self, index: usize) -> Result<Vec<f64>, SourceError> {
+        let mut count = self.shape(index);
+        let rank = count.len();
+        count[..rank - 2].fill(1);
+        let packing = self.packing(index)?;
+        Ok(self.file.read(index, vec![0; rank], count)?.into_iter().map(|v| packing.unpack(v)).collect())
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {

@@ -11,6 +11,7 @@ use super::axes::{AxisPlan, Quantity};
 use super::column::{in_column, in_layer};
 use super::component::{ComponentPlan, SquaredErrors, read_component};
 use super::nest::{Nest, Shift, places};
+use super::own_axes::LinearWeight;
 use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
 use crate::formats::DataFile;
@@ -78,32 +79,6 @@ impl Cells {
     /// Points of a component along x and y.
     fn points(&self, which: usize) -> [usize; 2] {
         [0, 1].map(|k| self.count[k] + usize::from(which == k))
-    }
-}
-
-/// Linear interpolation along one axis: two entries and the weight of the second.
-#[derive(Debug, Clone, Copy)]
-struct LinearWeight {
-    first: usize,
-    second: usize,
-    weight: f32,
-}
-
-impl LinearWeight {
-    /// At a position counted in entries, clamped to the ends.
-    fn at(place: f64, count: usize) -> Self {
-        let place = place.clamp(0.0, (count - 1) as f64);
-        let first = (place.floor() as usize).min(count.saturating_sub(2));
-        Self { first, second: (first + 1).min(count - 1), weight: (place - first as f64) as f32 }
-    }
-
-    fn of(self, value: impl Fn(usize) -> f32) -> f32 {
-        // A missing neighbour of weight 0 must not make the result missing.
-        match self.weight {
-            0.0 => value(self.first),
-            1.0 => value(self.second),
-            w => value(self.first) * (1.0 - w) + value(self.second) * w,
-        }
     }
 }
 

@@ -51,7 +51,19 @@ impl Planner<'_> {
         let (roles, packing) = ((0..rank).map(role).collect(), self.packing(variable)?);
         let (shape, dimensions) = (self.shape(variable), self.dimensions_of(variable));
         let name = v.name.clone();
-        Ok(ComponentPlan { name, shape, dimensions, roles, packing, factor, why: why.into(), of_water: false, mask: None, columns: None })
+        Ok(ComponentPlan {
+            name,
+            shape,
+            dimensions,
+            roles,
+            packing,
+            factor,
+            why: why.into(),
+            of_water: false,
+            mask: None,
+            columns: None,
+            own: Default::default(),
+        })
     }
 
     /// Plans WRF output. All files of an archive share the domain and the heights of the first.

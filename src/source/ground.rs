@@ -1,0 +1,142 @@
+//! Velocities over the ground on grids whose x does not run east, or whose metres are not those of the ground: projections and rotated poles.
+
+use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
+use crate::cf::coordinate::Kind;
+use crate::cf::velocity::says_eastward;
+use crate::error::SourceError;
+use crate::formats::DataFile;
+use crate::georeference::{Positions, is_in_metres, mapping};
+use crate::grids::Layout;
+use crate::projection::{Jacobian, Projection, turned};
+use rayon::iter::{IntoParallelIterator, ParallelIterator};
+
+/// Turns velocities over the ground to the x and y of a grid, and stretches them to its metres.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GroundToGrid {
+    /// For each node of a level, x fastest: x and y for the first component, then for the second: [xx, xy, yx, yy] of the matrix.
+    matrices: Vec<[f32; 4]>,
+}
+
+impl GroundToGrid {
+    /// What the velocities of an archive's first file need, by the names of the velocity, the grid mapping and the longitudes and latitudes of the nodes; and what
+    /// is done, as a sentence. `None` on grids that run east and north, or over which the file tells nothing.
+    ///
+    /// # Errors
+    /// The settings say that velocities run east and north, but the file does not tell where east is.
+    pub fn of(file: &DataFile, layout: &Layout, settings: &ArchiveSettings) -> Result<Option<(Option<Self>, String)>, SourceError> {
+        let variable = |name: &str| file.listing.find(name).map(|index| &file.listing.variables[index]);
+        let u = layout.frames[0].first().and_then(|component| variable(&component.name));
+        let x = variable(layout.axes[0].axis.name());
+        let is_rotated = x.is_some_and(|x| x.text("standard_name") == Some("grid_longitude") || x.name.eq_ignore_ascii_case("rlon"));
+        let is_plane = [layout.axes[0].kind, layout.axes[1].kind] == [Kind::X, Kind::Y];
+        let fits = layout.resampling.is_none() && layout.metric != Metric::Index && settings.velocity_unit == VelocityUnit::Si;
+        let (Some(u), true) = (u, fits && (is_plane || is_rotated)) else { return Ok(None) };
+        let eastward = match (settings.grid_relative, says_eastward(u)) {
+            (Some(true), _) => None,
+            (Some(false), _) => Some("as set".to_owned()),
+            (None, why) => why,
+        };
+        let known = Positions::of(file, layout);
+        let projection = Self::projection(file, layout, is_plane, known.as_ref());
+        let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
+        let nodes: Vec<[f64; 2]> = ys.iter().flat_map(|&y| xs.iter().map(move |&x| [x, y])).collect();
+        let jacobians: Option<Vec<Jacobian>> = match (&projection, &known) {
+            (Some(projection), _) => nodes.into_par_iter().map(|place| projection.jacobian(place)).collect(),
+            (None, Some(known)) => rows(&known.degrees, xs.len()),
+            (None, None) => None,
+        };
+        let by = if projection.is_some() { "the grid mapping" } else { "the longitudes and latitudes of the nodes" };
+        let scale = |[xe, xn, ye, yn]: &Jacobian| (xe * yn - xn * ye).abs().sqrt();
+        let range =
+            |values: &mut dyn Iterator<Item = f64>| values.fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], v| [a.min(v), b.max(v)]);
+        match (eastward, jacobians) {
+            (Some(why), Some(jacobians)) => {
+                let greatest = range(&mut jacobians.iter().map(|[xe, _, ye, _]| ye.atan2(*xe).abs().to_degrees()))[1];
+                let [least, most] = range(&mut jacobians.iter().map(scale));
+                let stretched = match is_plane && projection.is_some() {
+                    true => format!(", and stretched to its metres by {least:.4} to {most:.4}"),
+                    false => String::new(),
+                };
+                let note = format!(
+                    "velocities run east and north ({why}) and are turned to x and y by {by}, by up to {greatest:.1} degrees{stretched}; --set \
+                     archive.grid_relative=true if they run along x and y"
+                );
+                Ok(Some((Some(Self::new(jacobians.into_iter())), note)))
+            }
+            (None, Some(jacobians)) if is_plane && projection.is_some() => {
+                let [least, most] = range(&mut jacobians.iter().map(scale));
+                let note = format!(
+                    "velocities run along x and y, and are stretched to the metres of the projection by {least:.4} to {most:.4}; --set \
+                     archive.grid_relative=false if they run east and north"
+                );
+                let stretches = jacobians.iter().map(scale).map(|scale| [scale, 0.0, 0.0, scale]);
+                Ok(Some((Some(Self::new(stretches)), note)))
+            }
+            (None, _) => Ok(settings.grid_relative.map(|_| (None, "velocities run along x and y, as set".into()))),
+            (Some(why), None) => {
+                let what = "neither a grid mapping that is known nor longitudes and latitudes of its points tell where east is";
+                if settings.grid_relative.is_some() {
+                    return Err(SourceError::variable(
+                        &file.listing.path,
+                        &u.name,
+                        format!("{what}, which archive.grid_relative=false needs"),
+                    ));
+                }
+                let note = format!(
+                    "WARNING: velocities run east and north ({why}), but are taken along x and y: {what}; name a file of its longitudes and \
+                     latitudes too, or write --set archive.grid_relative=true if they do run along x and y"
+                );
+                Ok(Some((None, note)))
+            }
+        }
+    }
+
+    /// The projection of the grid mapping, unless longitudes and latitudes of the file lie elsewhere.
+    fn projection(file: &DataFile, layout: &Layout, is_plane: bool, known: Option<&Positions>) -> Option<Projection> {
+        let projection = Projection::of(&mapping(file, layout)?)?;
+        if matches!(projection, Projection::Plane { .. }) != is_plane || (is_plane && !is_in_metres(layout)) {
+            return None;
+        }
+        let Some(known) = known else { return Some(projection) };
+        let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
+        let agrees = |i: usize, j: usize| {
+            let (Some(found), expected) = (projection.position([xs[i], ys[j]]), known.degrees[j * xs.len() + i]) else { return false };
+            let east = (found[0] - expected[0] + 180.0).rem_euclid(360.0) - 180.0;
+            // Ellipsoids differ by a fifth of a degree.
+            expected[0].is_nan() || (east * expected[1].to_radians().cos()).hypot(found[1] - expected[1]) < 0.25
+        };
+        let [right, top] = [xs.len() - 1, ys.len() - 1];
+        (agrees(0, 0) && agrees(right, 0) && agrees(0, top) && agrees(right, top)).then_some(projection)
+    }
+
+    fn new(matrices: impl Iterator<Item = Jacobian>) -> Self {
+        Self { matrices: matrices.map(|matrix| matrix.map(|d| d as f32)).collect() }
+    }
+
+    /// Turns and stretches the first two components, level after level.
+    pub fn apply(&self, components: &mut [Vec<f32>]) {
+        let [u, v, ..] = components else { return };
+        for (node, (u, v)) in u.iter_mut().zip(v).enumerate() {
+            let [xx, xy, yx, yy] = self.matrices[node % self.matrices.len()];
+            (*u, *v) = (xx * *u + xy * *v, yx * *u + yy * *v);
+        }
+    }
+}
+
+/// Turns at nodes with known longitudes and latitudes, by second-order differences along rows of `width`.
+fn rows(degrees: &[[f64; 2]], width: usize) -> Option<Vec<Jacobian>> {
+    let turn = |node: usize| {
+        let at = |step: isize| degrees[node.wrapping_add_signed(step)];
+        let row = match node % width {
+            0 if width < 3 => [(at(1), 1.0), (at(0), -1.0), (at(0), 0.0)],
+            _ if width < 3 => [(at(0), 1.0), (at(-1), -1.0), (at(0), 0.0)],
+            0 => [(at(1), 4.0), (at(2), -1.0), (at(0), -3.0)],
+            column if column + 1 == width => [(at(-1), -4.0), (at(-2), 1.0), (at(0), 3.0)],
+            _ => [(at(1), 1.0), (at(-1), -1.0), (at(0), 0.0)],
+        };
+        // Velocities at nodes that lie nowhere are missing.
+        turned(degrees[node], row).unwrap_or([f64::NAN; 4])
+    };
+    let found: Vec<Jacobian> = (0..degrees.len()).map(turn).collect();
+    found.iter().any(|jacobian| jacobian[0].is_finite()).then_some(found)
+}
