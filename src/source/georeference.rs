@@ -280,7 +280,8 @@ impl Georeference {
             new.mapping = in_file.or((layout.metric == Metric::Sphere).then(own));
             return new;
         }
-        new.mapping = in_file.filter(|_| is_in_metres(layout));
+        // Its coordinates became metres.
+        new.mapping = in_file.filter(|_| unit_of_plane(layout) == Some(1.0));
         if new.mapping.is_some() {
             for (axis, name) in new.axes.iter_mut().zip(["projection_x_coordinate", "projection_y_coordinate"]) {
                 axis.standard_name = Some(name.into());
@@ -296,11 +297,11 @@ impl Georeference {
     }
 }
 
-/// True if x and y are metres in the file: a false easting counts in the unit of the coordinates.
-pub(crate) fn is_in_metres(layout: &Layout) -> bool {
-    layout.axes[..2]
-        .iter()
-        .all(|plan| plan.in_file.as_ref().is_some_and(|i| Unit::parse(&i.units).is_some_and(|u| u.is_length() && u.factor == 1.0)))
+/// Metres in the unit of x and y in the file, in which a false easting counts too. `None` if they are no lengths, or differ.
+pub(crate) fn unit_of_plane(layout: &Layout) -> Option<f64> {
+    let factor = |plan: &AxisPlan| Unit::parse(&plan.in_file.as_ref()?.units).filter(Unit::is_length).map(|unit| unit.factor);
+    let [x, y] = [factor(&layout.axes[0])?, factor(&layout.axes[1])?];
+    (x == y).then_some(x)
 }
 
 /// The grid mapping of the velocity, if the CF conventions know it. A universal transverse Mercator projection that is given in the words of PROJ is

@@ -5,7 +5,7 @@ use crate::cf::coordinate::Kind;
 use crate::cf::velocity::says_eastward;
 use crate::error::SourceError;
 use crate::formats::DataFile;
-use crate::georeference::{Positions, is_in_metres, mapping};
+use crate::georeference::{Positions, mapping, unit_of_plane};
 use crate::grids::Layout;
 use crate::projection::{Jacobian, Projection, turned};
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
@@ -93,10 +93,8 @@ impl GroundToGrid {
 
     /// The projection of the grid mapping, unless longitudes and latitudes of the file lie elsewhere.
     fn projection(file: &DataFile, layout: &Layout, is_plane: bool, known: Option<&Positions>) -> Option<Projection> {
-        let projection = Projection::of(&mapping(file, layout)?)?;
-        if matches!(projection, Projection::Plane { .. }) != is_plane || (is_plane && !is_in_metres(layout)) {
-            return None;
-        }
+        let unit = if is_plane { unit_of_plane(layout)? } else { 1.0 };
+        let projection = Projection::of(&mapping(file, layout)?, unit).filter(|p| matches!(p, Projection::Plane { .. }) == is_plane)?;
         let Some(known) = known else { return Some(projection) };
         let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
         let agrees = |i: usize, j: usize| {

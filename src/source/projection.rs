@@ -20,8 +20,8 @@ pub enum Projection {
 pub type Jacobian = [f64; 4];
 
 impl Projection {
-    /// From the words of the CF conventions, appendix F. `None` for projections that are not known here.
-    pub fn of(mapping: &GridMapping) -> Option<Self> {
+    /// From the words of the CF conventions, appendix F; `unit` are metres in a unit of x and y in the file. `None` for projections that are not known here.
+    pub fn of(mapping: &GridMapping, unit: f64) -> Option<Self> {
         let number = |name: &str| mapping.number(name);
         if mapping.kind() == "rotated_latitude_longitude" {
             let pole = [number("grid_north_pole_longitude")?, number("grid_north_pole_latitude")?];
@@ -60,7 +60,7 @@ impl Projection {
             }
             _ => {}
         }
-        let shift = ["false_easting", "false_northing"].map(|name| number(name).unwrap_or(0.0));
+        let shift = ["false_easting", "false_northing"].map(|name| number(name).unwrap_or(0.0) * unit);
         words.push(format!("+x_0={} +y_0={} +units=m +no_defs", shift[0], shift[1]));
         let plane = Proj::from_proj_string(&format!("{} {globe}", words.join(" "))).ok()?;
         let ground = Proj::from_proj_string(&format!("+proj=longlat {globe} +no_defs")).ok()?;
@@ -174,7 +174,7 @@ mod tests {
                 ("earth_radius", &[6.371e6]),
             ],
         );
-        let polar = Projection::of(&polar).unwrap();
+        let polar = Projection::of(&polar, 1.0).unwrap();
         let place = [1.2e6, -2.0e6];
         let [longitude, latitude] = polar.position(place).unwrap();
         let expected = 90.0 - 2.0 * (1.2e6f64.hypot(2e6) / (2.0 * 6.371e6)).atan().to_degrees();
@@ -191,7 +191,7 @@ mod tests {
                 ("earth_radius", &[6_371_229.0]),
             ],
         );
-        let cone = Projection::of(&cone).unwrap();
+        let cone = Projection::of(&cone, 1.0).unwrap();
         close(cone.jacobian([0.0, 0.0]).unwrap(), [1.0, 0.0, 0.0, 1.0], 1e-7);
         let place = [4e5, 3e5];
         let turn = 46.5f64.to_radians().sin() * (cone.position(place).unwrap()[0] - 2.0).to_radians();
@@ -209,12 +209,12 @@ mod tests {
                 ("inverse_flattening", &[298.257_223_563]),
             ],
         );
-        let utm = Projection::of(&utm).unwrap();
+        let utm = Projection::of(&utm, 1.0).unwrap();
         close(utm.jacobian([500_000.0, 5.5e6]).unwrap(), [0.9996, 0.0, 0.0, 0.9996], 1e-7);
         let [longitude, latitude] = utm.position([740_000.0, 5.4e6]).unwrap();
         let [xe, _, ye, _] = utm.jacobian([740_000.0, 5.4e6]).unwrap();
         let expected = ((longitude - 9.0).to_radians().tan() * latitude.to_radians().sin()).atan();
         close([ye.atan2(xe), xe.hypot(ye)], [expected, 0.9996 * (1.0 + 0.5 * (240_000.0f64 / 0.9996 / 6.38e6).powi(2))], 2e-5);
-        assert!(Projection::of(&mapping("geostationary", &[])).is_none());
+        assert!(Projection::of(&mapping("geostationary", &[]), 1.0).is_none());
     }
 }

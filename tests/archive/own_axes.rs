@@ -1,6 +1,7 @@
 //! Components on coordinates of their own: Arakawa's C grid in rows, and vertical velocities between the levels of the others.
 
 use crate::kit::netcdf::*;
+use crate::real::{independent, report};
 use crate::{HOURS, inspected, notes, open, open_with, refused};
 use ridgewatch::field::{Geometry, Snapshot};
 use ridgewatch::source::SnapshotSource;
@@ -197,4 +198,71 @@ fn w_between_the_levels_of_a_mesh_is_interpolated_to_them() {
     for (level, expected) in [(0, 21.0), (1, 21.0), (2, 16.0), (3, 11.0), (4, 6.0), (5, 1.0)] {
         assert!((up(level) - expected).abs() < 1e-3, "level {level}: {} {expected}", up(level));
     }
+}
+
+/// CROCO and ROMS on a plane: numbers of columns as coordinates of one dimension, places of the centres alone in two, levels that follow the bottom.
+#[test]
+fn faces_between_centres_of_a_plane_follow_the_bottom() {
+    let dir = tempdir().unwrap();
+    let (nx, ny, nz) = (6usize, 5usize, 3usize);
+    let mut fixture =
+        Fixture::new(CLASSIC, &[("time", 2), ("s_rho", nz), ("eta_rho", ny), ("eta_v", ny - 1), ("xi_rho", nx), ("xi_u", nx - 1)]);
+    fixture = fixture.axis("time", HOURS, &[0.0, 1.0]);
+    for (name, count) in [("xi_rho", nx), ("xi_u", nx - 1), ("eta_rho", ny), ("eta_v", ny - 1)] {
+        let numbers: Vec<f64> = (1..=count).map(|n| n as f64).collect();
+        fixture = fixture
+            .axis(name, "", &numbers)
+            .with("standard_name", "x_grid_index")
+            .with("axis", if name.starts_with('x') { "X" } else { "Y" });
+    }
+    for (k, name) in ["x_rho", "y_rho"].into_iter().enumerate() {
+        let at = |i: usize| 1000.0 * [i % nx, i / nx][k] as f64;
+        fixture = fixture.variable(name, &["eta_rho", "xi_rho"], f32s((0..nx * ny).map(at).collect())).with("units", "meter");
+    }
+    let s = [-0.75, -0.5, -0.25];
+    fixture = fixture.variable("s_rho", &["s_rho"], f32s(s.to_vec())).with("standard_name", "ocean_sigma_coordinate");
+    fixture = fixture.with("formula_terms", "sigma: s_rho eta: zeta depth: h");
+    fixture = fixture.variable("h", &["eta_rho", "xi_rho"], f32s(vec![100.0; nx * ny])).with("units", "meter");
+    fixture = fixture.variable("zeta", &["time", "eta_rho", "xi_rho"], f32s(vec![0.0; 2 * nx * ny])).with("units", "meter");
+    for (which, (name, [eta, xi], [ny, nx], shift)) in [
+        ("u", ["eta_rho", "xi_u"], [ny, nx - 1], [500.0, 0.0]),
+        ("v", ["eta_v", "xi_rho"], [ny - 1, nx], [0.0, 500.0]),
+        ("w", ["eta_rho", "xi_rho"], [ny, nx], [0.0; 2]),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let at = |i: usize| [1000.0 * (i % nx) as f64 + shift[0], 1000.0 * (i / nx % ny) as f64 + shift[1], 100.0 * s[i / (nx * ny) % nz]];
+        let values = (0..2 * nx * ny * nz).map(|i| linear(which, at(i), (i / (nx * ny * nz)) as f64)).collect();
+        fixture = fixture.variable(name, &["time", "s_rho", eta, xi], f32s(values)).with("units", "meter second-1");
+    }
+    let mut archive = open_with(&[fixture.write(&dir.path().join("croco.nc"))], "heights = [-70.0, -50.0, -30.0]");
+    let grid = archive.grid().clone();
+    assert!(matches!(grid.geometry, Geometry::Cartesian));
+    assert_eq!((grid.shape(), grid.axes[0].first(), grid.axes[0].last()), ([9, 7, 3], 500.0, 4500.0));
+    let snapshot = archive.read(1).unwrap();
+    for (i, node) in snapshot.nodes.iter().enumerate() {
+        let at = [i % 9, i / 9 % 7, i / 63];
+        let at: [f64; 3] = std::array::from_fn(|k| grid.axes[k].coordinates()[at[k]]);
+        for c in 0..3 {
+            assert!((f64::from(node[c]) - linear(c, at, 1.0)).abs() < 2e-5, "{at:?} {node:?}");
+        }
+    }
+    assert!(notes(&archive).contains("along x: `xi_u`, `xi_rho`"), "{}", notes(&archive));
+}
+
+/// A flow without symmetry on faces, beside an integration by other tools.
+#[test]
+#[ignore = "needs Python: make test-data"]
+fn faces_agree_with_an_independent_integration() {
+    let dir = tempdir().unwrap();
+    let field = |which: usize, [x, y, z]: [f64; 3], time: f64| {
+        let (a, b, c) = (x / 60.0 + 0.4 * time, y / 90.0 - 0.3 * time, z / 8.0);
+        0.02 * [a.sin() * b.cos() + 0.4 * c.sin(), 0.7 * (a.cos() - b).sin() + 0.2 * c.cos(), 0.03 * (a + b).sin() * c.cos()][which]
+    };
+    let file = staggered(field).write(&dir.path().join("faces.nc"));
+    let pairs = independent("rows", std::slice::from_ref(&file), 3600.0);
+    let (relative, correlation) = report("faces", 3600.0, &pairs);
+    // The same interpolant.
+    assert!(relative < 1e-6 && correlation > 0.999_999, "{relative} {correlation}");
 }

@@ -133,7 +133,7 @@ fn what_cannot_be_traced_says_why() {
 const PAIRS: usize = 50;
 
 /// Log-stretches at 50 seeds that live the whole tau, neighbours included: from this program and from tests/independent/ftle.py.
-fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
+pub fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
     let python = std::env::var_os("RIDGEWATCH_PYTHON").map_or_else(|| project(".venv/bin/python"), PathBuf::from);
     assert!(python.exists(), "{} is not there: make test-data installs it", python.display());
     let mut archive = open(files);
@@ -174,7 +174,7 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
 }
 
 /// Root mean square and median difference of the FTLE, per second, root mean square FTLE, correlation.
-fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, f64) {
+pub fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, f64) {
     let n = ours.len() as f64;
     let mean = |f: &dyn Fn(usize) -> f64| (0..ours.len()).map(f).sum::<f64>() / n;
     let rms = mean(&|i| (ours[i] - theirs[i]).powi(2)).sqrt();

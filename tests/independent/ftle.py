@@ -1,7 +1,7 @@
 """Log-stretch of the flow map by other tools than ridgewatch's: netCDF4 reads, SciPy integrates (DOP853), neighbours 2 gap apart are
 differenced. The interpolation is written here, straight from what the files hold.
 
-Standard input: {"kind": "era5" | "wrf" | "globcurrent", "files": [...], "points": [[x, y, z], ...], "count": how many are wanted,
+Standard input: {"kind": "era5" | "wrf" | "globcurrent" | "rows", "files": [...], "points": [[x, y, z], ...], "count": how many are wanted,
 "from": seconds, "tau": seconds (signed)}. Coordinates in metres, heights above the sea (ERA5: -7000 ln(p / 1000 hPa)); of GlobCurrent
 longitude and latitude in degrees. Standard output: log-stretches of the points, up to the one by which as many as wanted are known; where one
 of a point's neighbours met missing values, "neighbour", and "seed" where the point itself did."""
@@ -115,6 +115,48 @@ class Era5:
         return out
 
 
+class Rows:
+    """u, v and w as `UVEL`, `VVEL`, `WVEL` on (time, level, y, x), each with its own coordinates of one dimension, in metres: trilinear, linear in time;
+    beyond its levels a component is that of the last one."""
+
+    gaps, tolerance = [0.01, 0.01, 1e-3], 1e-11
+
+    def __init__(self, files):
+        d = netCDF4.Dataset(files[0])
+        self.time = seconds(d["T"])
+        self.own = []
+        for name in ("UVEL", "VVEL", "WVEL"):
+            t, *axes = d[name].dimensions
+            values, axes = filled(d[name][:]), [filled(d[axis][:]) for axis in axes]
+            for k, axis in enumerate(axes):
+                if axis[0] > axis[-1]:
+                    axes[k], values = axis[::-1], np.flip(values, k + 1)
+            self.own.append((axes, values))
+
+    def at(self, place, t):
+        time = cell(self.time, t)
+        if time is None:
+            return np.full(3, np.nan)
+        n, s = time
+        # Together they cover the levels of all.
+        lowest, highest = min(a[0][0] for a, _ in self.own), max(a[0][-1] for a, _ in self.own)
+        if not lowest <= place[2] <= highest:
+            return np.full(3, np.nan)
+        out = []
+        for axes, values in self.own:
+            z = np.clip(place[2], axes[0][0], axes[0][-1])
+            found = [cell(axis, q) for axis, q in zip(axes, (z, place[1], place[0]))]
+            if any(f is None for f in found):
+                return np.full(3, np.nan)
+            (k, c), (j, b), (i, a) = found
+            block = values[n : n + 2, k : k + 2, j : j + 2, i : i + 2]
+            along = block[..., 0] * (1 - a) + block[..., 1] * a
+            along = along[..., 0] * (1 - b) + along[..., 1] * b
+            along = along[..., 0] * (1 - c) + along[..., 1] * c
+            out.append(along[0] * (1 - s) + along[1] * s)
+        return np.array(out)
+
+
 class Wrf:
     """Arakawa C: each component from its own faces, each column between its own levels at the particle's place."""
 
@@ -193,7 +235,7 @@ def arrive(flow, start, begin, tau):
 
 def main():
     task = json.load(sys.stdin)
-    flow = {"era5": Era5, "wrf": Wrf, "globcurrent": GlobCurrent}[task["kind"]](task["files"])
+    flow = {"era5": Era5, "wrf": Wrf, "globcurrent": GlobCurrent, "rows": Rows}[task["kind"]](task["files"])
     out = []
     for point in task["points"]:
         if sum(not isinstance(value, str) for value in out) == task["count"]:

@@ -34,9 +34,10 @@ impl Part {
 /// A component without its partner at a time, or twice.
 pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<Vec<Group>>, SourceError> {
     let limits = limits(settings);
-    let (mut parts, mut helpers, mut helped) = (Vec::new(), Vec::new(), HashSet::new());
+    let (mut parts, mut helpers, mut helped, mut idle) = (Vec::new(), Vec::new(), HashSet::new(), None);
     for path in paths {
-        let Some(content) = DataFile::open(path, None, limits).ok().and_then(|file| content(&file, settings)) else { return Ok(None) };
+        let Ok(file) = DataFile::open(path, None, limits) else { return Ok(None) };
+        let Some(content) = content(&file, settings)? else { return Ok(None) };
         if content.components.contains(&true) {
             parts.push(Part { path: path.clone(), content });
         } else if content.helps {
@@ -45,12 +46,18 @@ pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<V
                 helpers.push(path.clone());
             }
         } else {
-            return Ok(None);
+            idle.get_or_insert_with(|| path.clone());
         }
     }
     let whole = |part: &Part| part.content.components[0] && part.content.components[1];
     if parts.is_empty() || (parts.iter().all(whole) && helpers.is_empty()) {
         return Ok(None);
+    }
+    if let Some(idle) = idle {
+        // Of whole files, the plan tells what it lacks.
+        let what = "it holds neither a component of the velocity nor a mesh or a mask: leave it out, or name its variable with --set archive.u=NAME, \
+                    archive.v, archive.w or archive.mask";
+        return if parts.iter().all(whole) { Ok(None) } else { Err(SourceError::file(&idle, what)) };
     }
     let held: [bool; 3] = [0, 1, 2].map(|k| parts.iter().any(|part| part.content.components[k]));
     let mut groups: Vec<Vec<Part>> = Vec::new();

@@ -77,7 +77,7 @@ const USUAL_NAMES: [[&str; 3]; 29] = [
 ];
 
 /// Further names of vertical velocities, of any family.
-const VERTICAL_NAMES: [&str; 5] = ["lagrangian_tendency_of_air_pressure", "omega", "wap", "vertical_velocity", "ww"];
+const VERTICAL_NAMES: [&str; 6] = ["lagrangian_tendency_of_air_pressure", "omega", "wap", "vertical_velocity", "ww", "wt"];
 
 /// A variable that may be a component.
 #[derive(Debug, Clone)]

@@ -3,7 +3,7 @@
 use super::axes::runs;
 use super::column::Columns;
 use super::land::Mask;
-use super::own_axes::{OwnAxis, read_interpolated};
+use super::own_axes::OwnAxis;
 use crate::cf::packing::Packing;
 use crate::error::SourceError;
 use crate::formats::DataFile;
@@ -48,7 +48,7 @@ impl ComponentPlan {
         self.roles.iter().zip(&self.shape).find(|(role, _)| **role == Role::Axis(axis)).map_or(1, |(_, &n)| n)
     }
 
-    /// Levels that [`read_levels`] counts.
+    /// Levels that [`super::own_axes::read_levels`] counts.
     pub fn levels(&self) -> usize {
         match (&self.columns, &self.own[2]) {
             (Some(columns), _) => columns.heights.len(),
@@ -128,18 +128,6 @@ pub fn read_component(file: &DataFile, component: &ComponentPlan, orders: &Order
         }
     }
     Ok(values)
-}
-
-/// The same with `orders` along the grid: heights if the levels of the file follow the bottom, nodes along axes on which the component has own
-/// coordinates, else entries of the file.
-///
-/// # Errors
-/// The values cannot be read.
-pub fn read_levels(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
-    match &component.columns {
-        Some(columns) => columns.read(file, component, orders, entry),
-        None => read_interpolated(file, component, orders, entry),
-    }
 }
 
 /// Sums of squares of interpolated values against exact ones.

@@ -6,6 +6,7 @@ use super::unstructured_plan::holds_mesh;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::coordinate::{Kind, classify, classify_name};
 use crate::cf::velocity::{Component, judge};
+use crate::error::SourceError;
 use crate::formats::{DataFile, Listing, Variable};
 
 /// Components and times of a file.
@@ -27,11 +28,14 @@ fn fixed(listing: &Listing) -> Vec<(String, Vec<usize>)> {
     listing.variables.iter().filter(|v| !moves(v)).map(|v| (v.name.clone(), listing.shape(v))).collect()
 }
 
-/// Contents of a file; `None` if its times are not understood.
-pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Option<Content> {
+/// Contents of a file; `None` if it does not name dimensions.
+///
+/// # Errors
+/// One component alone whose times are not understood.
+pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Result<Option<Content>, SourceError> {
     let listing = &file.listing;
     let found: Vec<(usize, Component)> = match settings.w.as_deref() {
-        _ if !listing.format.names_dimensions() => return None,
+        _ if !listing.format.names_dimensions() => return Ok(None),
         ignored => (0..listing.variables.len())
             .filter_map(|i| judge(listing, i, settings.velocity_units()).ok().map(|c| (i, c.component)))
             .filter(|(_, component)| *component != Component::W || ignored != Some("none"))
@@ -53,14 +57,19 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Option<Content> {
     };
     if let Some(variable) = variables.into_iter().flatten().next() {
         let mut planner = Planner::new(file, settings);
-        let extents = planner.extents(variable).ok()?;
-        let time = planner.time(&extents).ok()?;
+        let time = match planner.extents(variable).and_then(|extents| planner.time(&extents)) {
+            Ok(time) => time,
+            // What is wrong with whole files is told when they are planned.
+            Err(_) if content.components[..2] == [true; 2] => return Ok(None),
+            Err(error) => return Err(error),
+        };
         let show = |t: &f64| time.calendar.and_then(|c| c.iso(*t)).unwrap_or_else(|| format!("{t} s"));
         content.when = match &time.seconds[..] {
             [one] => show(one),
-            times => format!("{} times from {} to {}", times.len(), show(times.first()?), show(times.last()?)),
+            [first, .., last] => format!("{} times from {} to {}", time.seconds.len(), show(first), show(last)),
+            [] => "none".into(),
         };
         content.seconds = time.seconds;
     }
-    Some(content)
+    Ok(Some(content))
 }

@@ -8,8 +8,9 @@
 //! do not.
 
 use super::axes::{AxisPlan, Quantity};
-use super::component::{ComponentPlan, read_levels};
+use super::component::ComponentPlan;
 use super::locator::{Locator, Mesh, Target};
+use super::own_axes::read_levels;
 use super::refine::Choice;
 use crate::cf::coordinate::Kind;
 use crate::error::SourceError;

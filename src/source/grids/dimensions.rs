@@ -4,7 +4,7 @@ use super::planner::Planner;
 use crate::cf::coordinate::{Kind, classify, classify_name};
 use crate::cf::units::Unit;
 use crate::error::SourceError;
-use crate::formats::NumberType;
+use crate::formats::{NumberType, Variable};
 
 /// Longest coordinate variable that is read: a damaged header must not exhaust the memory.
 const MAX_COORDINATES: usize = 1 << 26;
@@ -111,7 +111,10 @@ impl Planner<'_> {
     /// A dimension with its coordinate variable and what it measures, regardless of the settings.
     pub fn measured(&self, dimension: usize) -> Extent {
         let name = &self.listing().dimensions[dimension].name;
-        let candidates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
+        // The number of a column tells no place.
+        let counts = |v: &Variable| v.text("standard_name").is_some_and(|name| name.contains("grid_index"));
+        let fits = |v: &Variable| v.dimensions == [dimension] && v.number.is_number() && !counts(v);
+        let candidates: Vec<usize> = self.listing().matching(fits).collect();
         let first = |fits: &dyn Fn(usize) -> bool| candidates.iter().copied().find(|&i| fits(i));
         let coordinate = first(&|i| self.variable(i).name == *name)
             .or_else(|| first(&|i| classify(self.variable(i)) != Kind::Unknown))

@@ -72,7 +72,7 @@ pub enum Resampling {
 }
 
 impl Resampling {
-    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`super::component::read_levels`] counts them.
+    /// Reads one entry along time onto the grid. `levels` are the grid's, as [`super::own_axes::read_levels`] counts them.
     ///
     /// # Errors
     /// The values cannot be read.

@@ -38,12 +38,13 @@ mod unstructured_plan;
 mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
-pub use component::{ComponentPlan, Orders, Role, read_component, read_levels};
+pub use component::{ComponentPlan, Orders, Role, read_component};
 pub use content::{Content, content};
 pub use land::Mask;
 pub use layout::{Layout, Resampling, difference};
 pub use levels::{REFERENCE_PRESSURE, SCALE_HEIGHT, to_heights};
 pub use mask::{Masks, NO_MASK, ZERO, holds_mask};
+pub use own_axes::read_levels;
 pub use plan::{plan, readable_axes};
 pub use poles::Poles;
 pub use refine::ResamplingError;

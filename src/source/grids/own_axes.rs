@@ -148,13 +148,17 @@ pub fn shared(plans: &[AxisPlan], centred: usize, staggering: Staggering) -> Res
     Ok(Some((AxisPlan { order: (0..axis.len()).collect(), axis, ..plans[centred].clone() }, places)))
 }
 
-/// Reads a component like [`read_component`]; along axes on which it has own coordinates, `orders` are nodes of the grid.
+/// Reads a component like [`read_component`]; along axes on which it has own coordinates, `orders` are nodes of the grid, and along levels that follow the
+/// bottom heights.
 ///
 /// # Errors
 /// The values cannot be read.
-pub fn read_interpolated(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
+pub fn read_levels(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
     let from = std::array::from_fn(|k| component.own[k].as_ref().map_or_else(|| orders[k].clone(), |own| own.order.clone()));
-    let mut values = read_component(file, component, &from, entry)?;
+    let mut values = match &component.columns {
+        Some(columns) => columns.read(file, component, &from, entry)?,
+        None => read_component(file, component, &from, entry)?,
+    };
     let mut counts = from.each_ref().map(Vec::len);
     for (k, own) in component.own.iter().enumerate() {
         let Some(own) = own else { continue };

@@ -70,9 +70,6 @@ impl Planner<'_> {
         let mut extents = self.extents(u)?;
         let terrain = self.terrain(velocity, &mut extents, first)?;
         let w = self.vertical_candidate(velocity, terrain.as_ref());
-        if terrain.is_some() {
-            self.check_same_points(velocity, w, terrain.as_ref())?;
-        }
         self.name_by_position(u, &mut extents)?;
         let level = if terrain.is_some() { None } else { self.pick_level(&extents)? };
         let time = self.time(&extents)?;
@@ -84,11 +81,9 @@ impl Planner<'_> {
         let w_in_use = w.filter(|_| three);
         let candidates: Vec<&Candidate> = [Some(&velocity.u), Some(&velocity.v), w_in_use].into_iter().flatten().collect();
         let mut own = vec![extents.clone(); candidates.len()];
-        if terrain.is_none() {
-            for (which, candidate) in candidates.iter().enumerate().skip(1) {
-                let extents = self.own_extents(candidate.variable, &extents).filter(|own| metric != Metric::Index || *own == extents);
-                own[which] = extents.ok_or_else(|| self.apart(u, candidate.variable))?;
-            }
+        for (which, candidate) in candidates.iter().enumerate().skip(1) {
+            let extents = self.own_extents(candidate.variable, &extents).filter(|own| metric != Metric::Index || *own == extents);
+            own[which] = extents.ok_or_else(|| self.apart(u, candidate.variable))?;
         }
 
         let mut axes = Vec::new();
@@ -110,13 +105,8 @@ impl Planner<'_> {
                 _ => {}
             }
         }
-        let mut roles: Vec<Vec<(usize, Role)>> =
+        let roles: Vec<Vec<(usize, Role)>> =
             own.iter().map(|extents| extents.iter().map(|extent| (extent.dimension, role(extent))).collect()).collect();
-        // w may lie between the levels of u.
-        if let (Some(terrain), Some(w), Some(roles)) = (&terrain, w_in_use, roles.get_mut(2)) {
-            let own = self.variable(w.variable).dimensions.iter().filter(|&&d| terrain.is_along(2, d));
-            roles.extend(own.map(|&d| (d, Role::Axis(2))));
-        }
         let mut components =
             vec![self.component(&velocity.u, &roles[0], Some(&axes[0]))?, self.component(&velocity.v, &roles[1], Some(&axes[1]))?];
         let of_w = roles.get(2).map_or(&[][..], Vec::as_slice);
@@ -187,7 +177,8 @@ impl Planner<'_> {
         let Some((axis, own)) = shared(&plans, centred, self.settings.staggering).map_err(|fault| self.fault(fault))? else {
             return Ok((plans.swap_remove(0), Vec::new()));
         };
-        let mut names: Vec<String> = plans.iter().map(|plan| format!("`{}`", plan.axis.name())).collect();
+        let mut names: Vec<String> =
+            along.iter().map(|(_, extent)| format!("`{}`", self.listing().dimensions[extent.dimension].name)).collect();
         names.dedup();
         let (names, nodes) = (names.join(", "), axis.axis.len());
         self.note(match self.settings.staggering {
@@ -227,19 +218,6 @@ impl Planner<'_> {
                 );
                 Err(self.misfit(variable, what))
             }
-        }
-    }
-
-    fn check_same_points(&self, found: &Velocity, w: Option<&Candidate>, terrain: Option<&Terrain>) -> Result<(), SourceError> {
-        let but_levels = |which: usize, variable: usize| {
-            let dims = &self.variable(variable).dimensions;
-            dims.iter().copied().filter(|&d| terrain.is_none_or(|t| !t.is_along(which, d))).collect::<Vec<_>>()
-        };
-        let u = found.u.variable;
-        let others = [Some((1, found.v.variable)), w.map(|w| (2, w.variable))];
-        match others.into_iter().flatten().find(|&(which, other)| but_levels(which, other) != but_levels(0, u)) {
-            Some((_, other)) => Err(self.apart(u, other)),
-            None => Ok(()),
         }
     }
 
@@ -315,30 +293,32 @@ impl Planner<'_> {
     }
 
     /// A coordinate of two dimensions in metres that varies along `dimension` only, and its values there: of idealised models, whose meshes are rectangles.
+    /// Else the middles of one whose dimension has one point more, as faces lie between centres.
     fn separable(&self, dimension: usize, k: usize) -> Result<Option<(usize, Vec<f64>)>, SourceError> {
         let listing = self.listing();
-        let kinds = [[Kind::X, Kind::Longitude], [Kind::Y, Kind::Latitude]];
-        let Some(kinds) = kinds.get(k) else { return Ok(None) };
-        let fits = |v: &Variable| {
-            v.dimensions.len() >= 2
-                && v.dimensions.last_chunk::<2>().is_some_and(|plane| plane.contains(&dimension))
-                && v.number.is_number()
-        };
-        for index in listing.matching(fits).collect::<Vec<_>>() {
-            let kind = classify(self.variable(index));
-            if !kinds.contains(&kind) || !self.is_in_metres(kind, index) {
-                continue;
-            }
-            let shape = self.shape(index);
-            let [rows, width] = [shape[shape.len() - 2], shape[shape.len() - 1]];
-            listing.check_count(self.variable(index), &[rows, width])?;
-            let plane = self.plane(index)?;
-            let is_row = self.variable(index).dimensions.last() == Some(&dimension);
-            let values: Vec<f64> = if is_row { plane[..width].to_vec() } else { plane.iter().step_by(width).copied().collect() };
-            let range = values.iter().fold(0.0f64, |m, v| m.max((v - values[0]).abs()));
-            let is_alike = |(i, v): (usize, &f64)| (v - values[if is_row { i % width } else { i / width }]).abs() <= 1e-6 * range;
-            if range > 0.0 && plane.iter().enumerate().all(is_alike) {
-                return Ok(Some((index, values)));
+        let Some(kinds) = [[Kind::X, Kind::Longitude], [Kind::Y, Kind::Latitude]].get(k) else { return Ok(None) };
+        let count = listing.dimensions[dimension].len;
+        let wide = |v: &Variable| v.dimensions.len() >= 2 && v.number.is_number() && kinds.contains(&classify(v));
+        for more in [0, 1] {
+            for index in listing.matching(wide).collect::<Vec<_>>() {
+                let variable = self.variable(index);
+                // x runs along the last dimension.
+                let along = variable.dimensions[variable.dimensions.len() - 1 - k];
+                let fits = if more == 0 { along == dimension } else { listing.dimensions[along].len == count + 1 };
+                if !fits || !self.is_in_metres(classify(variable), index) {
+                    continue;
+                }
+                let shape = self.shape(index);
+                let [rows, width] = [shape[shape.len() - 2], shape[shape.len() - 1]];
+                listing.check_count(variable, &[rows, width])?;
+                let plane = self.plane(index)?;
+                let values: Vec<f64> = if k == 0 { plane[..width].to_vec() } else { plane.iter().step_by(width).copied().collect() };
+                let range = values.iter().fold(0.0f64, |m, v| m.max((v - values[0]).abs()));
+                let is_alike = |(i, v): (usize, &f64)| (v - values[if k == 0 { i % width } else { i / width }]).abs() <= 1e-6 * range;
+                if range > 0.0 && plane.iter().enumerate().all(is_alike) {
+                    let between = values.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
+                    return Ok(Some((index, if more == 0 { values } else { between })));
+                }
             }
         }
         Ok(None)

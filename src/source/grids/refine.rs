@@ -4,9 +4,10 @@
 //! mesh itself (inverse bilinear, see [`super::curvilinear`]) on one snapshot: at the mesh's own points, and at places anywhere between
 //! them. The grid is refined until both errors are small, or a bound is reached.
 
-use super::component::{ComponentPlan, SquaredErrors, read_levels};
+use super::component::{ComponentPlan, SquaredErrors};
 use super::curvilinear::{Curvilinear, Vectors, locators};
 use super::locator::Target;
+use super::own_axes::read_levels;
 use crate::error::SourceError;
 use crate::formats::DataFile;
 use std::fmt;
