@@ -238,17 +238,19 @@ fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
             refined.grid().shape(),
             kept.grid().shape()
         );
-        // 1 % is reached over the whole mesh; in its middle, the jet errs by more.
+        // 0.6 % is reached over the whole mesh; in its middle, the jet errs by more.
         assert!(velocity < 0.016 && coarse_velocity > 2.0 * velocity, "{name}: {velocity} and {coarse_velocity}");
         // Against the flow itself, the error of interpolation in the mesh remains.
         assert!(exact < own + 0.016, "{name}: {exact} and {own}");
-        assert!(ftle < 0.05 && coarse_ftle > 1.5 * ftle, "{name}: {ftle} and {coarse_ftle}");
+        // Across the edges of triangles the gradient jumps, and a grid does not follow them.
+        let most = if sea.triangles { 0.05 } else { 0.03 };
+        assert!(ftle < most && coarse_ftle > 1.5 * ftle, "{name}: {ftle} and {coarse_ftle}");
         let report = inspected(&[&file]).resampling.unwrap();
         println!("  {report:?}");
         let share = |error: f64| error / report.velocity;
         // Between the points, the error is stated at other places than those by which the grid was chosen.
-        assert!(share(report.error) < 0.04 && share(report.error_between.unwrap()) < 0.011 && report.warning.is_none(), "{report:?}");
-        assert!(report.what.contains("times finer than the mesh's median spacing, for errors of at most 4 %"), "{}", report.what);
+        assert!(share(report.error) < 0.025 && share(report.error_between.unwrap()) < 0.007 && report.warning.is_none(), "{report:?}");
+        assert!(report.what.contains("times finer than the mesh's median spacing, for errors of at most 2.5 %"), "{}", report.what);
     }
 }
 

@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 /// Errors that the grid is refined to, as shares of the root mean square velocity: at the file's own points, where interpolation in the mesh has its
 /// kinks and the error is largest, and between them, where particles are.
-const WANTED: [f64; 2] = [0.04, 0.01];
+const WANTED: [f64; 2] = [0.025, 0.006];
 /// Multiple of these above which there is a warning.
 pub const LARGE: f64 = 2.0;
 /// Most nodes of a refined grid, levels included.
@@ -90,7 +90,8 @@ pub enum Stop {
 impl fmt::Display for Choice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self::Mesh { factor, stopped } = self else { return f.write_str("as set") };
-        let [points, between] = WANTED.map(|share| 100.0 * share);
+        // In tenths of a per cent.
+        let [points, between] = WANTED.map(|share| (1000.0 * share).round() / 10.0);
         let wanted = format!("{points} % at the file's own points and {between} % between them");
         if *factor > 1.0 {
             write!(f, "{factor:.1} times finer than the mesh's median spacing")?;
