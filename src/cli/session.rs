@@ -394,13 +394,20 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
     }
 }
 
+/// Share traced from which the surrogate saves next to nothing.
+const NOTHING_SAVED: f64 = 0.9;
+
 /// Describes a frame in one line.
 pub fn line(record: &FrameRecord) -> String {
     let mut text = match &record.date {
         Some(date) => format!("{date}, "),
         None => format!("t = {}, ", record.time),
     };
-    text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries - record.missing);
+    let queries = record.queries - record.missing;
+    text += &match record.method == "gated" && record.traced_share >= NOTHING_SAVED {
+        true => format!("the surrogate saved nothing: {:.1} % of {queries} queries were traced", 100.0 * record.traced_share),
+        false => format!("traced {:.1} % of {queries} queries", 100.0 * record.traced_share),
+    };
     if record.missing > 0 {
         text += &format!(", {} more on land", record.missing);
     }

@@ -6,6 +6,8 @@ const HOLD = 15_000;
 const MOST_ENTRIES = 100;
 // Of many records that arrive together, only these are news.
 const FRESH = 5;
+// Said with the first frame of each slide of which it is true.
+const COARSE_IN_TIME = /\bcoarse in time\b/;
 const LOST_SIMULATION = /\bsimulation (is gone|has ended)\b/;
 
 /** Messages, newest first; those that differ in numbers only are one entry with a count. */
@@ -42,6 +44,7 @@ export class Warnings {
     this.held = new Map();
     this.live = null;
     this.lostAtStep = null;
+    this.coarse = null;
   }
 
   /** Tells of something now, and logs it. `id` is one of a few. */
@@ -62,13 +65,21 @@ export class Warnings {
       this.hold("budget", `Tracing budget spent: ${count(overBudget)} queries in untrusted cells were answered by the surrogate`, frame, fresh);
     }
     if (checkpoint?.failed) this.hold("checkpoint", `A checkpoint could not be written: ${checkpoint.failed}`, frame, fresh);
-    this.readWarnings(Array.isArray(record.warnings) ? record.warnings : [], frame, fresh);
+    const warnings = Array.isArray(record.warnings) ? record.warnings.map(String) : [];
+    this.readWarnings(warnings, frame, fresh);
+    this.readCoarse(record.slide, warnings.find((text) => COARSE_IN_TIME.test(text)));
     if (record.live) this.readLive(record, fresh);
   }
 
   readWarnings(texts, frame, fresh) {
-    for (const text of texts) this.hold("run", String(text), frame, fresh);
+    for (const text of texts) this.hold("run", text, frame, fresh);
     if (fresh && texts.length > 1) this.held.get("run").text += ` (and ${texts.length - 1} more: see the messages)`;
+  }
+
+  /** Holds for all frames of a slide. */
+  readCoarse(slide, text) {
+    if (text !== undefined) this.coarse = { slide, text };
+    else if (this.coarse !== null && slide !== this.coarse.slide) this.coarse = null;
   }
 
   readLive({ live, frame, warnings }, fresh) {
@@ -94,6 +105,7 @@ export class Warnings {
     if (this.lostAtStep !== null) {
       found.push({ id: "simulation", level: "critical", text: "The simulation has ended or is gone. The picture shows its last steps." });
     }
+    if (this.coarse !== null) found.push({ id: "time", level: "warning", text: `Too ${this.coarse.text}` });
     for (const [id, { text, until }] of this.held) {
       if (until > now) found.push({ id, level: id === "tolerance" ? "critical" : "warning", text });
       else this.held.delete(id);

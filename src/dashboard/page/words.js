@@ -53,14 +53,23 @@ function lagWords(record) {
   return known(behind) ? `${duration(behind)} behind the simulation` : "lag unknown";
 }
 
-const tracedWords = (record) => (known(record.traced_share) ? `${percent(record.traced_share)} traced` : "share traced unknown");
+// Share traced from which the surrogate saves next to nothing.
+const NOTHING_SAVED = 0.9;
 
-/** Frame, slide, time, lag, error and share traced of a record. */
+function tracedWords(record) {
+  const share = record.traced_share;
+  if (!known(share)) return "share traced unknown";
+  const saved = record.method === "gated" && share >= NOTHING_SAVED;
+  return saved ? `the surrogate saved nothing: ${percent(share)} was traced` : `${percent(share)} traced`;
+}
+
+const stepWords = (record) => (record.live ? `step ${count(record.live.step)}` : null);
+
+/** Frame, slide, step of the simulation, time, lag, error and share traced of a record. */
 export function frameWords(record) {
   const when = record.date ? `t = ${record.date}` : `t = ${time(record.time, record.time_unit)}`;
-  return [`frame ${count(record.frame)}`, `slide ${count(record.slide)}`, when, lagWords(record), errorWords(record), tracedWords(record)]
-    .filter(Boolean)
-    .join(", ");
+  const state = [lagWords(record), errorWords(record), tracedWords(record)];
+  return [`frame ${count(record.frame)}`, `slide ${count(record.slide)}`, stepWords(record), when, ...state].filter(Boolean).join(", ");
 }
 
 /** The sentence of state. `view` has `link`, `status`, `endpoint`, `silence` (seconds), `record` (newest) and `back` (`{ record, behind }` while looking back). */

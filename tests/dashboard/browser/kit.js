@@ -6,6 +6,7 @@ import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import http from "node:http";
 import { tmpdir } from "node:os";
 import path from "node:path";
+import { inflateSync } from "node:zlib";
 import { WebSocket, WebSocketServer } from "ws";
 
 export const REPOSITORY = path.resolve(import.meta.dirname, "../../..");
@@ -166,4 +167,40 @@ export async function until(what, probe, milliseconds = 20_000) {
     if (Date.now() > end) throw new Error(`not within ${milliseconds} ms: ${what}`);
     await new Promise((resolve) => setTimeout(resolve, 50));
   }
+}
+
+/** Channels of a picture as the program writes it (openexr.com, "OpenEXR File Layout": one part, 32-bit floats, ZIP): its width, and by name values in rows. */
+export function readExr(bytes) {
+  let at = 8;
+  const text = () => { const [from, end] = [at, bytes.indexOf(0, at)]; at = end + 1; return bytes.toString("latin1", from, end); };
+  const header = {};
+  for (let name = text(); name; name = text()) {
+    text();
+    const length = bytes.readInt32LE(at);
+    header[name] = bytes.subarray(at + 4, at + 4 + length);
+    at += 4 + length;
+  }
+  const [left, top, right, bottom] = [0, 4, 8, 12].map((place) => header.dataWindow.readInt32LE(place));
+  const [width, height] = [right - left + 1, bottom - top + 1];
+  const names = [];
+  for (let list = header.channels; list[0]; list = list.subarray(list.indexOf(0) + 17)) names.push(list.toString("latin1", 0, list.indexOf(0)));
+  const channels = Object.fromEntries(names.map((name) => [name, new Float32Array(width * height)]));
+  // A table of places, then blocks of 16 rows: differences of bytes, lower bytes first.
+  at += 8 * Math.ceil(height / 16);
+  for (let first = 0; first < height; first += 16) {
+    const rows = Math.min(16, height - first);
+    const packed = bytes.subarray(at + 8, at + 8 + bytes.readInt32LE(at + 4));
+    at += 8 + packed.length;
+    let block = packed;
+    if (packed.length < 4 * rows * width * names.length) {
+      const mixed = inflateSync(packed);
+      for (let i = 1; i < mixed.length; i += 1) mixed[i] = (mixed[i] + mixed[i - 1] - 128) & 255;
+      block = Buffer.from(mixed.map((_, i) => mixed[(i >> 1) + (i % 2) * Math.ceil(mixed.length / 2)]));
+    }
+    let place = 0;
+    for (let row = first; row < first + rows; row += 1) {
+      for (const name of names) for (let x = 0; x < width; x += 1, place += 4) channels[name][row * width + x] = block.readFloatLE(place);
+    }
+  }
+  return { width, channels };
 }

@@ -5,7 +5,7 @@ import { existsSync, mkdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { valueWords } from "../../../src/dashboard/page/values.js";
-import { PROGRAM, TOKEN, launch, startDashboard, startShown, stop, temporary, until } from "./kit.js";
+import { PROGRAM, TOKEN, launch, readExr, startDashboard, startShown, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 const folder = temporary();
@@ -96,12 +96,17 @@ test("a frame that stands still is told and saved as it is shown", async () => {
   const frame = await number(page);
   await point(page, [30, 30]);
   await until("its value", async () => (await line(page)).startsWith(`frame ${frame.toLocaleString("en-GB")} at 30, 30:`));
+  const value = await line(page);
   await page.screenshot({ path: path.join(SCREENSHOTS, "values.png") });
   const [png, exr, record] = [await saved(page, "png"), await saved(page, "exr"), await saved(page, "json")];
   const name = new RegExp(`^run-frame-${String(frame).padStart(6, "0")}-slide-\\d{4}\\.(png|exr|json)$`);
   for (const file of [png, exr, record]) assert.match(file.name, name);
   assert.deepEqual([...exr.bytes.subarray(0, 4)], [0x76, 0x2f, 0x31, 0x01]);
   assert.equal(JSON.parse(record.bytes).frame, frame);
+  const film = readExr(exr.bytes);
+  const channels = Object.fromEntries(Object.entries(film.channels).map(([name, values]) => [name, values[30 * film.width + 30]]));
+  const [, unit] = /FTLE \S+ (\S+),/.exec(value) ?? [];
+  assert.equal(value, valueWords({ frame, x: 30, y: 30, unit, channels }), "the value that is told is that of the EXR");
   const [drawn, decoded] = await pixels(page, png.bytes);
   assert.deepEqual(drawn, decoded);
   await page.click("#pause");

@@ -218,6 +218,20 @@ test("a range of colours is in a later record, and on the colour bar", async () 
   });
 });
 
+test("other colours change the picture, and nothing is traced anew for them", async () => {
+  await steered("box", async (page, where) => {
+    const { frame, slide, transfer } = newest(where);
+    await page.fill("#high", String(1.5 * transfer.high));
+    await page.press("#high", "Enter");
+    const record = await commanded(where, frame, ["transfer"]);
+    const before = where.records().find((other) => other.frame === record.frame - 1);
+    assert.ok(Math.abs(record.transfer.high / transfer.high - 1.5) < 1e-9 && record.slide === slide);
+    // What was audited before counts under the new colours: each frame has its own share of audit points, and no more.
+    assert.equal(record.preparation_traces, 0);
+    assert.ok(record.audited <= 1.5 * before.audited, `${record.audited} after ${before.audited}`);
+  });
+});
+
 test("method and budget are in effect with a later record, and a budget needs its method", async () => {
   await steered("map", async (page, where) => {
     const { frame, method } = newest(where);

@@ -5,20 +5,20 @@ import { Warnings } from "../../../src/dashboard/page/warnings.js";
 import { duration, facts, lag, number, percent, sentence, shareOfPeak, windowWords } from "../../../src/dashboard/page/words.js";
 
 const record = {
-  frame: 8120, slide: 812, time: 3.2, time_unit: "s", date: null, tau: 2, direction: "backward", live: { age: 0.3 }, seconds: { total: 0.1 },
+  frame: 8120, slide: 812, time: 3.2, time_unit: "s", date: null, tau: 2, direction: "backward", live: { age: 0.3, step: 40600 }, seconds: { total: 0.1 },
   picture_error: { psnr: { value: 41, low: 40, high: 42 } }, traced_share: 0.12,
 };
 const following = { link: "open", status: "following", record };
 
 test("a followed simulation is told in one sentence", () => {
-  const expected = "Following, frame 8,120, slide 812, t = 3.2 s, 0.4 s behind the simulation, error 0.89 % (41 dB), 12 % traced.";
+  const expected = "Following, frame 8,120, slide 812, step 40,600, t = 3.2 s, 0.4 s behind the simulation, error 0.89 % (41 dB), 12 % traced.";
   assert.equal(sentence(following), expected);
 });
 
 test("null and missing values are unknown and never 0", () => {
   for (const none of [null, undefined]) {
     const poor = { ...record, time: none, picture_error: none, trusted_error: none, traced_share: none, live: { age: none }, queries: none };
-    const expected = "Following, frame 8,120, slide 812, t = –, lag unknown, error unknown, share traced unknown.";
+    const expected = "Following, frame 8,120, slide 812, step –, t = –, lag unknown, error unknown, share traced unknown.";
     assert.equal(sentence({ ...following, record: poor }), expected);
     assert.equal(facts(poor).traced, "– of – queries");
     assert.equal(windowWords(poor), "–");
@@ -31,6 +31,12 @@ test("null and missing values are unknown and never 0", () => {
 test("without a calendar or a simulation neither is mentioned", () => {
   const text = sentence({ ...following, record: { ...record, live: null, time_unit: "" } });
   assert.equal(text, "Following, frame 8,120, slide 812, t = 3.2, error 0.89 % (41 dB), 12 % traced.");
+});
+
+test("a surrogate that saves nothing is told so", () => {
+  const gated = { ...record, method: "gated", traced_share: 0.954 };
+  assert.match(sentence({ ...following, record: gated }), /the surrogate saved nothing: 95 % was traced\.$/);
+  assert.match(sentence({ ...following, record: { ...gated, method: "reference", traced_share: 1 } }), /, 100 % traced\.$/);
 });
 
 test("a lost connection, a silent publisher and looking back are said first", () => {
@@ -56,6 +62,17 @@ test("what a frame warns of is a condition and a message", () => {
   warnings.read([{ ...record, tolerance_excess: 0.004, over_budget: 3, live: { missed_blocks: 2, steps_incomplete: 0, steps_skipped: 1, restarts: 1, step: 5 } }]);
   assert.deepEqual(conditions(warnings), ["tolerance", "budget", "drops", "coarse", "restart"]);
   assert.equal(warnings.log.entries.size, 5);
+});
+
+test("a slide that is too coarse in time is told in all its frames", () => {
+  const warnings = new Warnings();
+  const text = "coarse in time: without every second snapshot the FTLE changes by 40 % of its root mean square";
+  warnings.read([{ ...record, live: null, warnings: [text] }]);
+  for (let frame = 1; frame < 40; frame += 1) warnings.read([{ ...record, live: null, frame: record.frame + frame, warnings: [] }]);
+  const told = warnings.conditions({ link: "open", status: "following" }).find(({ id }) => id === "time");
+  assert.equal(told.text, `Too ${text}`);
+  warnings.read([{ ...record, live: null, slide: record.slide + 1, warnings: [] }]);
+  assert.ok(!conditions(warnings).includes("time"));
 });
 
 test("counts that do not rise are no news", () => {
