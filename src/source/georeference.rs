@@ -172,11 +172,6 @@ impl Coordinate {
 }
 
 impl GridMapping {
-    /// First number of an attribute.
-    pub(crate) fn number(&self, name: &str) -> Option<f64> {
-        self.numbers(name).first().copied()
-    }
-
     /// Numbers of an attribute.
     pub(crate) fn numbers(&self, name: &str) -> &[f64] {
         match self.attributes.iter().find(|(n, _)| n == name) {

@@ -94,7 +94,11 @@ impl GroundToGrid {
     /// The projection of the grid mapping, unless longitudes and latitudes of the file lie elsewhere.
     fn projection(file: &DataFile, layout: &Layout, is_plane: bool, known: Option<&Positions>) -> Option<Projection> {
         let unit = if is_plane { unit_of_plane(layout)? } else { 1.0 };
-        let projection = Projection::of(&mapping(file, layout)?, unit).filter(|p| matches!(p, Projection::Plane { .. }) == is_plane)?;
+        let mapping = mapping(file, layout)?;
+        let projection = Projection::of(mapping.kind(), |name| mapping.numbers(name), unit)?;
+        if matches!(projection, Projection::Plane { .. }) != is_plane {
+            return None;
+        }
         let Some(known) = known else { return Some(projection) };
         let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
         let agrees = |i: usize, j: usize| {

@@ -1,6 +1,5 @@
 //! Where the points of a projection or of a rotated pole lie, and how its plane is turned and stretched there.
 
-use crate::georeference::GridMapping;
 use proj4rs::proj::Proj;
 use proj4rs::transform::transform;
 use ridgewatch_field::EARTH_RADIUS;
@@ -20,10 +19,11 @@ pub enum Projection {
 pub type Jacobian = [f64; 4];
 
 impl Projection {
-    /// From the words of the CF conventions, appendix F; `unit` are metres in a unit of x and y in the file. `None` for projections that are not known here.
-    pub fn of(mapping: &GridMapping, unit: f64) -> Option<Self> {
-        let number = |name: &str| mapping.number(name);
-        if mapping.kind() == "rotated_latitude_longitude" {
+    /// From the words of the CF conventions, appendix F: the name of a grid mapping, and its attributes of numbers by their names; `unit` are metres in a unit of
+    /// x and y in the file. `None` for projections that are not known here.
+    pub fn of<'a>(kind: &str, numbers: impl Fn(&str) -> &'a [f64], unit: f64) -> Option<Self> {
+        let number = |name: &str| numbers(name).first().copied();
+        if kind == "rotated_latitude_longitude" {
             let pole = [number("grid_north_pole_longitude")?, number("grid_north_pole_latitude")?];
             return Some(Self::Rotated { pole, turned: number("north_pole_grid_longitude").unwrap_or(0.0) });
         }
@@ -37,11 +37,11 @@ impl Projection {
         let origin = number("latitude_of_projection_origin");
         let meridian = number("longitude_of_central_meridian").or(number("longitude_of_projection_origin"));
         let scale = number("scale_factor_at_projection_origin").or(number("scale_factor_at_central_meridian"));
-        let parallels = mapping.numbers("standard_parallel");
-        let mut words = vec![match mapping.kind() {
+        let parallels = numbers("standard_parallel");
+        let mut words = vec![match kind {
             "transverse_mercator" => format!("+proj=tmerc +lat_0={}", origin?),
             "lambert_conformal_conic" | "albers_conical_equal_area" => {
-                let (name, first) = (if mapping.kind().starts_with('l') { "lcc" } else { "aea" }, *parallels.first()?);
+                let (name, first) = (if kind.starts_with('l') { "lcc" } else { "aea" }, *parallels.first()?);
                 let second = parallels.get(1).unwrap_or(&first);
                 format!("+proj={name} +lat_1={first} +lat_2={second} +lat_0={}", origin.unwrap_or(first))
             }
@@ -55,9 +55,7 @@ impl Projection {
         words.push(format!("+lon_0={meridian}"));
         match (scale, parallels) {
             (Some(scale), _) => words.push(format!("+k_0={scale}")),
-            (None, [parallel]) if ["polar_stereographic", "mercator"].contains(&mapping.kind()) => {
-                words.push(format!("+lat_ts={parallel}"))
-            }
+            (None, [parallel]) if ["polar_stereographic", "mercator"].contains(&kind) => words.push(format!("+lat_ts={parallel}")),
             _ => {}
         }
         let shift = ["false_easting", "false_northing"].map(|name| number(name).unwrap_or(0.0) * unit);
@@ -79,6 +77,14 @@ impl Projection {
         }
     }
 
+    /// x and y of a longitude and latitude in degrees; of planes only.
+    pub fn in_plane(&self, [longitude, latitude]: [f64; 2]) -> Option<[f64; 2]> {
+        let Self::Plane { plane, globe, .. } = self else { return None };
+        let mut point = (longitude.to_radians(), latitude.to_radians(), 0.0);
+        transform(globe, plane, &mut point).ok()?;
+        Some([point.0, point.1]).filter(|place| place.iter().all(|c| c.is_finite()))
+    }
+
     /// How the plane lies at a point. About a rotated pole, x and y are metres on the ground too.
     pub fn jacobian(&self, place: [f64; 2]) -> Option<Jacobian> {
         match self {
@@ -87,17 +93,13 @@ impl Projection {
                 let [from, to] = [ends[0]?, ends[1]?];
                 turned(self.position(place)?, [(from, -1.0), (to, 1.0)])
             }
-            Self::Plane { plane, globe, major, eccentricity } => {
+            Self::Plane { major, eccentricity, .. } => {
                 let [longitude, latitude] = self.position(place)?;
                 let sine = latitude.to_radians().sin();
                 let square = 1.0 - eccentricity * sine * sine;
                 let [east, north] = [latitude.to_radians().cos() * major / square.sqrt(), major * (1.0 - eccentricity) / square.powf(1.5)];
-                let in_plane = |longitude: f64, latitude: f64| {
-                    let mut point = (longitude.to_radians(), latitude.to_radians(), 0.0);
-                    transform(globe, plane, &mut point).ok().map(|()| [point.0, point.1])
-                };
                 let ends = |step: [f64; 2]| {
-                    let [from, to] = [-1.0, 1.0].map(|s| in_plane(longitude + s * step[0], latitude + s * step[1]));
+                    let [from, to] = [-1.0, 1.0].map(|s| self.in_plane([longitude + s * step[0], latitude + s * step[1]]));
                     let metres = 2.0 * STEP.to_radians() * if step[0] == 0.0 { north } else { east };
                     Some([0, 1].map(|k| Some((to?[k] - from?[k]) / metres)))
                 };
@@ -138,12 +140,9 @@ fn from_rotated(rotated: [f64; 2], pole: [f64; 2]) -> [f64; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::georeference::MappingValue;
 
-    fn mapping(kind: &str, numbers: &[(&str, &[f64])]) -> GridMapping {
-        let mut attributes = vec![("grid_mapping_name".to_owned(), MappingValue::Text(kind.into()))];
-        attributes.extend(numbers.iter().map(|(name, values)| (name.to_string(), MappingValue::Numbers(values.to_vec()))));
-        GridMapping { name: "crs".into(), attributes }
+    fn of(kind: &str, numbers: &'static [(&str, &[f64])]) -> Option<Projection> {
+        Projection::of(kind, |name| numbers.iter().find(|(n, _)| *n == name).map_or(&[][..], |(_, values)| values), 1.0)
     }
 
     fn close<const N: usize>(found: [f64; N], expected: [f64; N], tolerance: f64) {
@@ -165,7 +164,7 @@ mod tests {
     #[test]
     fn planes_are_turned_and_stretched() {
         // Polar stereographic sphere: meridian 0 runs down from the pole, east is (cos, sin) and the scale 2 / (1 + sin latitude).
-        let polar = mapping(
+        let polar = of(
             "polar_stereographic",
             &[
                 ("latitude_of_projection_origin", &[90.0]),
@@ -174,7 +173,7 @@ mod tests {
                 ("earth_radius", &[6.371e6]),
             ],
         );
-        let polar = Projection::of(&polar, 1.0).unwrap();
+        let polar = polar.unwrap();
         let place = [1.2e6, -2.0e6];
         let [longitude, latitude] = polar.position(place).unwrap();
         let expected = 90.0 - 2.0 * (1.2e6f64.hypot(2e6) / (2.0 * 6.371e6)).atan().to_degrees();
@@ -182,7 +181,7 @@ mod tests {
         let ((sine, cosine), scale) = (longitude.to_radians().sin_cos(), 2.0 / (1.0 + latitude.to_radians().sin()));
         close(polar.jacobian(place).unwrap(), [cosine, -sine, sine, cosine].map(|d| d * scale), 1e-7);
         // Lambert's cone: meridians turn by the sine of the parallel times the longitude; no stretch on the parallel.
-        let cone = mapping(
+        let cone = of(
             "lambert_conformal_conic",
             &[
                 ("standard_parallel", &[46.5]),
@@ -191,14 +190,14 @@ mod tests {
                 ("earth_radius", &[6_371_229.0]),
             ],
         );
-        let cone = Projection::of(&cone, 1.0).unwrap();
+        let cone = cone.unwrap();
         close(cone.jacobian([0.0, 0.0]).unwrap(), [1.0, 0.0, 0.0, 1.0], 1e-7);
         let place = [4e5, 3e5];
         let turn = 46.5f64.to_radians().sin() * (cone.position(place).unwrap()[0] - 2.0).to_radians();
         let [xe, xn, ye, yn] = cone.jacobian(place).unwrap();
         close([ye.atan2(xe), (-xn).atan2(yn), xe.hypot(ye) - xn.hypot(yn)], [turn, turn, 0.0], 1e-7);
         // UTM: 0.9996 on the meridian; elsewhere the convergence is near the longitude from it times the sine of the latitude.
-        let utm = mapping(
+        let utm = of(
             "transverse_mercator",
             &[
                 ("latitude_of_projection_origin", &[0.0]),
@@ -209,12 +208,12 @@ mod tests {
                 ("inverse_flattening", &[298.257_223_563]),
             ],
         );
-        let utm = Projection::of(&utm, 1.0).unwrap();
+        let utm = utm.unwrap();
         close(utm.jacobian([500_000.0, 5.5e6]).unwrap(), [0.9996, 0.0, 0.0, 0.9996], 1e-7);
         let [longitude, latitude] = utm.position([740_000.0, 5.4e6]).unwrap();
         let [xe, _, ye, _] = utm.jacobian([740_000.0, 5.4e6]).unwrap();
         let expected = ((longitude - 9.0).to_radians().tan() * latitude.to_radians().sin()).atan();
         close([ye.atan2(xe), xe.hypot(ye)], [expected, 0.9996 * (1.0 + 0.5 * (240_000.0f64 / 0.9996 / 6.38e6).powi(2))], 2e-5);
-        assert!(Projection::of(&mapping("geostationary", &[]), 1.0).is_none());
+        assert!(of("geostationary", &[]).is_none());
     }
 }

@@ -1,10 +1,11 @@
 //! GRIB: the velocities are those of the same data as NetCDF, and what cannot be read is refused by name.
 
-use crate::kit::grib::{HEIGHT, ISOBARIC, LevelType, Message, OMEGA, Parameter, TEMPERATURE, U, V, real, write};
+use crate::kit::grib::{HEIGHT, ISOBARIC, LevelType, Message, OMEGA, Parameter, TEMPERATURE, U, V, cone, real, write};
 use crate::kit::mutants::random;
 use crate::kit::netcdf::*;
 use crate::kit::program;
 use crate::{HOURS, inspected, notes, open, open_with, refused, same};
+use ridgewatch::field::Geometry;
 use ridgewatch::source::SnapshotSource;
 use tempfile::tempdir;
 
@@ -31,6 +32,7 @@ fn messages(edition: u8, parameter: Parameter, component: usize, times: usize, l
         order: 0,
         values: (0..40).map(|i| value(component, [time, level, i / 8, i % 8])).collect(),
         bits: 12,
+        plane: None,
     };
     (0..times).flat_map(|time| (0..levels.len()).map(move |level| (time, level))).map(|(time, level)| field(time, level)).collect()
 }
@@ -244,7 +246,7 @@ fn what_is_missing_or_unknown_is_told_by_name() {
             change(8 + 13, 13, &["is no date"]);
         } else {
             change(16 + 21 + 13, 50, &["spherical harmonics", "cdo -f nc sp2gpl"]);
-            change(16 + 21 + 13, 20, &["its grid is a polar stereographic projection", "wgrib2 IN -new_grid_winds earth"]);
+            change(16 + 21 + 13, 23, &["its grid is a polar stereographic projection", "wgrib2 IN -new_grid_winds earth"]);
             change(16 + 21 + 10, 4, &["a reduced grid", "cdo -f nc setgridtype,regular"]);
             change(16 + 21 + 9, 41, &["its grid of 8 x 5 nodes is said to have 41"]);
             change(16 + 21 + 72 + 34 + 10, 51, &["it is packed as spherical harmonics"]);
@@ -340,4 +342,44 @@ fn what_eccodes_packs_is_unpacked() {
             assert!(missing || node[..2] == [expected(1), expected(2)], "{packing}, {x} {y}: {node:?}");
         }
     }
+}
+
+/// Lambert's cone, with winds along the grid and with winds to the east and north.
+#[test]
+fn projections_of_edition_2_are_planes() {
+    let dir = tempdir().unwrap();
+    let grib = dir.path().join("cone.grib2");
+    let winds = |along: bool| -> Vec<Message> {
+        let of = |(component, parameter)| {
+            messages(2, parameter, component, 2, &isobaric()[..1])
+                .into_iter()
+                .map(move |message| Message { plane: Some(cone(along)), ..message })
+        };
+        let mut all: Vec<Message> = [(0, U), (1, V)].into_iter().flat_map(of).collect();
+        all.iter_mut().for_each(|message| message.values = vec![if message.parameter == U { 8.0 } else { 0.0 }; 40]);
+        all
+    };
+    let read = |along: bool| {
+        write(&winds(along), &grib);
+        let mut archive = open(&[&grib]);
+        let grid = archive.grid().clone();
+        assert!(matches!(grid.geometry, Geometry::Cartesian));
+        // As NOAA states its first node, on a sphere of 6371229 m.
+        let first = [grid.axes[0].first() + 2_697_520.14, grid.axes[1].first() + 1_587_306.15];
+        assert!(first.iter().all(|apart| apart.abs() < 1.0), "{first:?}");
+        assert_eq!((grid.shape(), grid.axes[0].uniform_step(), grid.axes[1].uniform_step()), ([8, 5, 1], Some(3000.0), Some(3000.0)));
+        (archive.read(1).unwrap().nodes[0], notes(&archive))
+    };
+    let (along, said) = read(true);
+    assert!(said.contains("velocities run along x and y, and are stretched"), "{said}");
+    // Scale of the cone at a latitude (Snyder 1987, page 107): n = sin 38.5 degrees.
+    let (n, latitude) = (38.5f64.to_radians().sin(), 21.138_123f64.to_radians());
+    let tangent = |latitude: f64| (std::f64::consts::FRAC_PI_4 + latitude / 2.0).tan();
+    let scale = 38.5f64.to_radians().cos() * (tangent(38.5f64.to_radians()) / tangent(latitude)).powf(n) / latitude.cos();
+    assert!((f64::from(along[0]) - 8.0 * scale).abs() < 1e-5 && along[1] == 0.0, "{along:?} {scale}");
+    let (east, said) = read(false);
+    assert!(said.contains("velocities run east and north"), "{said}");
+    let turn = n * (237.280_472f64 - 262.5).to_radians();
+    let expected = [8.0 * scale * turn.cos(), 8.0 * scale * turn.sin()];
+    assert!((0..2).all(|k| (f64::from(east[k]) - expected[k]).abs() < 1e-5), "{east:?} {expected:?}");
 }

@@ -35,6 +35,29 @@ pub struct Message {
     pub values: Vec<f64>,
     /// Bits of a packed number.
     pub bits: u8,
+    /// Template of section 3 of edition 2, and its octets from 39 on: another grid of as many nodes.
+    pub plane: Option<(u8, Vec<u8>)>,
+}
+
+/// Octets from 39 on of template 3.30 (Lambert's cone): the grid of the High-Resolution Rapid Refresh (NOAA), every 3 km northwards and eastwards.
+pub fn cone(along_grid: bool) -> (u8, Vec<u8>) {
+    let degrees = |value: f64| signed((value * 1e6).round() as i64, 4);
+    let step = 3_000_000u32.to_be_bytes();
+    let octets = [
+        &degrees(21.138_123)[..],
+        &degrees(237.280_472),
+        &[if along_grid { 0x08 } else { 0 }],
+        &degrees(38.5),
+        &degrees(262.5),
+        &step,
+        &step,
+        &[0, 0x40],
+        &degrees(38.5),
+        &degrees(38.5),
+        &degrees(-90.0),
+        &degrees(0.0),
+    ];
+    (30, octets.concat())
 }
 
 /// Numbers are packed in quarters.
@@ -110,24 +133,12 @@ impl Message {
         let word = |n: usize| (n as u32).to_be_bytes();
         let (x, y) = (self.longitudes, self.latitudes);
         let reference = [&[0, 98, 0, 0, 30, 0, 1][..], &2000u16.to_be_bytes(), &[1, 1, self.hour, 0, 0, 0, 1]].concat();
-        let grid = [
-            &[0][..],
-            &word(x.2 * y.2),
-            &[0, 0, 0, 0, 6],
-            &[255; 15],
-            &word(x.2),
-            &word(y.2),
-            &[0; 4],
-            &[255; 4],
-            &degrees(y.0),
-            &degrees(x.0),
-            &[0],
-            &degrees(y.1),
-            &degrees(x.1),
-            &[255; 8],
-            &[self.scanning()],
-        ]
-        .concat();
+        let template = self.plane.as_ref().map_or(0, |plane| plane.0);
+        let head = [&[0][..], &word(x.2 * y.2), &[0, 0, 0, template, 6], &[255; 15], &word(x.2), &word(y.2)].concat();
+        let rows =
+            [&[0; 4][..], &[255; 4], &degrees(y.0), &degrees(x.0), &[0], &degrees(y.1), &degrees(x.1), &[255; 8], &[self.scanning()]]
+                .concat();
+        let grid = [head, self.plane.as_ref().map_or(rows, |plane| plane.1.clone())].concat();
         let template = if self.member.is_some() { 1 } else { 0 };
         let surface = [&[kind, 0][..], &word((level * unit) as usize), &[255, 0, 0, 0, 0, 0]].concat();
         let mut product = [&[0, 0, 0, template, category, number, 2, 0, 0, 0, 0, 0, 1][..], &word(self.step.into()), &surface].concat();

@@ -3,14 +3,14 @@
 use super::super::limits::MAX_OBJECTS;
 use super::super::messages::{Attribute, Dimension, FormatFault, Listing, NumberType, UNREADABLE, Variable};
 use super::date;
-use super::grid::{Axis, Grid, Regular};
+use super::grid::{Axis, Grid, Mapping, Regular};
 use super::message::{Kind, Message, Place};
 use super::names::Levels;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Most Gaussian grids of a file: their latitudes take time to compute.
-const MAX_GAUSSIAN: usize = 16;
+/// Most grids of a file whose coordinates are computed, which takes time: Gaussian ones and projections.
+const MAX_COMPUTED: usize = 16;
 
 /// What a variable holds.
 pub enum Content {
@@ -65,7 +65,7 @@ pub fn listed(listing: Listing, messages: Vec<Message>) -> Result<(Listing, Vec<
     }
     drop(known);
     resolve(&mut all);
-    let mut list = List { listing, contents: Vec::new(), axes: Vec::new() };
+    let mut list = List { listing, contents: Vec::new(), axes: Vec::new(), mappings: Vec::new() };
     let mut places = Vec::new();
     let names = names(&all.iter().map(|fields| &fields.kind).collect::<Vec<_>>());
     for (fields, name) in all.into_iter().zip(names) {
@@ -74,16 +74,16 @@ pub fn listed(listing: Listing, messages: Vec<Message>) -> Result<(Listing, Vec<
     Ok((list.listing, places, list.contents))
 }
 
-/// Computes the latitudes of Gaussian grids.
+/// Computes the latitudes of Gaussian grids, and the coordinates of projections.
 fn resolve(all: &mut [Fields]) {
     let mut resolved: HashMap<Grid, Grid> = HashMap::new();
     for fields in all {
-        if let Grid::Regular(Regular { y: Axis::Gaussian { .. }, .. }) = fields.kind.grid {
+        if fields.kind.grid.is_open() {
             let grid = fields.kind.grid.clone();
-            fields.kind.grid = if resolved.len() < MAX_GAUSSIAN || resolved.contains_key(&grid) {
+            fields.kind.grid = if resolved.len() < MAX_COMPUTED || resolved.contains_key(&grid) {
                 resolved.entry(grid.clone()).or_insert_with(|| grid.resolved()).clone()
             } else {
-                Grid::Other(format!("the file holds more than {MAX_GAUSSIAN} Gaussian grids"))
+                Grid::Other(format!("the file holds more than {MAX_COMPUTED} Gaussian or projected grids"))
             };
         }
     }
@@ -181,6 +181,8 @@ struct List {
     contents: Vec<Content>,
     /// Name, coordinates and dimension of each axis.
     axes: Vec<(String, Axis, usize)>,
+    /// Grid mappings that have a variable; the first one is `crs`.
+    mappings: Vec<Mapping>,
 }
 
 impl List {
@@ -201,9 +203,22 @@ impl List {
         });
         let (number, content) = match (fields.kind.grid, fields.fault) {
             (Grid::Regular(grid), fault) => {
-                let degrees = |name: &str, units: &str| [text("standard_name", name), text("units", units)];
-                dimensions.push(self.axis("latitude", grid.y.clone(), &degrees("latitude", "degrees_north")));
-                dimensions.push(self.axis("longitude", grid.x.clone(), &degrees("longitude", "degrees_east")));
+                let [y, x] = match &grid.mapping {
+                    None => [["latitude", "latitude", "degrees_north"], ["longitude", "longitude", "degrees_east"]],
+                    Some(mapping) if mapping.is_plane() => [["y", "projection_y_coordinate", "m"], ["x", "projection_x_coordinate", "m"]],
+                    Some(_) => [["rlat", "grid_latitude", "degrees"], ["rlon", "grid_longitude", "degrees"]],
+                };
+                for ([name, standard, units], axis) in [(y, &grid.y), (x, &grid.x)] {
+                    dimensions.push(self.axis(name, axis.clone(), &[text("standard_name", standard), text("units", units)]));
+                }
+                if let Some(mapping) = &grid.mapping {
+                    attributes.push(text("grid_mapping", self.mapping(mapping)));
+                    if mapping.along_grid {
+                        for (_, value) in attributes.iter_mut().filter(|(name, _)| name == "standard_name") {
+                            along_grid(value);
+                        }
+                    }
+                }
                 match fault {
                     None => {
                         let from = places.len();
@@ -226,6 +241,22 @@ impl List {
         self.contents.push(content);
     }
 
+    /// Name of the variable of a grid mapping, which is added if it is new.
+    fn mapping(&mut self, mapping: &Mapping) -> String {
+        let name = |index: usize| if index == 0 { "crs".to_owned() } else { format!("crs{index}") };
+        if let Some(known) = self.mappings.iter().position(|known| known == mapping) {
+            return name(known);
+        }
+        let name = name(self.mappings.len());
+        let mut attributes = vec![text("grid_mapping_name", mapping.kind)];
+        attributes
+            .extend(mapping.numbers().into_iter().map(|(name, values)| (name.into(), Attribute::Numbers(NumberType::Float64, values))));
+        self.listing.variables.push(Variable { name: name.clone(), number: NumberType::Int32, dimensions: Vec::new(), attributes });
+        self.contents.push(Content::Unread);
+        self.mappings.push(mapping.clone());
+        name
+    }
+
     /// The dimension of an axis, which is added with its coordinates if it is new. Another one of the same name gets a number.
     fn axis(&mut self, base: &str, axis: Axis, attributes: &[(String, Attribute)]) -> usize {
         if let Some((.., dimension)) = self.axes.iter().find(|(name, known, _)| name == base && *known == axis) {
@@ -240,6 +271,24 @@ impl List {
         self.contents.push(Content::Axis(axis.clone()));
         self.axes.push((base.to_owned(), axis, dimension));
         dimension
+    }
+}
+
+/// The standard name of a velocity along the axes of its grid.
+fn along_grid(name: &mut Attribute) {
+    let Attribute::Text(text) = name else { return };
+    for (eastward, along) in [
+        ("eastward_wind", "x_wind"),
+        ("northward_wind", "y_wind"),
+        ("eastward_sea_water_velocity", "sea_water_x_velocity"),
+        ("northward_sea_water_velocity", "sea_water_y_velocity"),
+        ("eastward_sea_ice_velocity", "sea_ice_x_velocity"),
+        ("northward_sea_ice_velocity", "sea_ice_y_velocity"),
+    ] {
+        if text == eastward {
+            along.clone_into(text);
+            return;
+        }
     }
 }
 

@@ -1,6 +1,8 @@
-//! Grids: regular longitudes and latitudes, regular Gaussian grids, and the order in which their values are stored.
+//! Grids: regular longitudes and latitudes, also about a rotated pole, regular Gaussian grids, planes of projections, and the order in which their values are
+//! stored.
 
 use super::message::{signed, unsigned};
+use crate::projection::Projection;
 
 /// Most nodes along an axis, as for other formats.
 const MAX_NODES: u32 = 1 << 24;
@@ -24,7 +26,37 @@ pub struct Regular {
     pub y: Axis,
     /// Flag table 8 of edition 1, 3.4 of edition 2.
     scanning: u8,
+    /// `None` for longitudes and latitudes.
+    pub mapping: Option<Mapping>,
 }
+
+/// Where rows and columns lie that are no parallels and meridians, in the words of the CF conventions, appendix F.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Mapping {
+    pub kind: &'static str,
+    /// Attributes, with the bits of each number as `f64`.
+    numbers: Vec<(&'static str, Vec<u64>)>,
+    /// True if vectors run along rows and columns, and not east and north.
+    pub along_grid: bool,
+}
+
+impl Mapping {
+    fn new(kind: &'static str, along_grid: bool, numbers: &[(&'static str, &[f64])]) -> Self {
+        let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect();
+        Self { kind, numbers: numbers.iter().map(|(name, values)| (*name, bits(values))).collect(), along_grid }
+    }
+
+    /// True if x and y are metres.
+    pub fn is_plane(&self) -> bool {
+        self.kind != ROTATED_POLE
+    }
+
+    pub fn numbers(&self) -> Vec<(&'static str, Vec<f64>)> {
+        self.numbers.iter().map(|(name, bits)| (*name, bits.iter().map(|&bits| f64::from_bits(bits)).collect())).collect()
+    }
+}
+
+const ROTATED_POLE: &str = "rotated_latitude_longitude";
 
 /// The coordinates along a dimension.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -33,6 +65,9 @@ pub enum Axis {
     Even { first: i64, last: i64, count: u32, longitude: bool },
     /// The latitudes of a Gaussian grid from the first to the last (millionths of a degree): see [`Grid::resolved`].
     Gaussian { parallels: u32, first: i64, last: i64, count: u32 },
+    /// x or y of a projection: steps in thousandths of a metre from the first node, which lies at this longitude and latitude (millionths of a degree):
+    /// see [`Grid::resolved`].
+    Plane { first: [i64; 2], step: i64, count: u32 },
     /// The bits of each coordinate as `f64`.
     Listed(Vec<u64>),
 }
@@ -45,7 +80,7 @@ impl Axis {
 
     pub fn len(&self) -> usize {
         match self {
-            Self::Even { count, .. } | Self::Gaussian { count, .. } => *count as usize,
+            Self::Even { count, .. } | Self::Gaussian { count, .. } | Self::Plane { count, .. } => *count as usize,
             Self::Listed(values) => values.len(),
         }
     }
@@ -61,7 +96,7 @@ impl Axis {
                 }
                 (*first as f64 + step * index as f64) / 1e6
             }
-            Self::Gaussian { .. } => f64::NAN,
+            Self::Gaussian { .. } | Self::Plane { .. } => f64::NAN,
             Self::Listed(values) => f64::from_bits(values[index]),
         }
     }
@@ -76,11 +111,12 @@ pub struct Corners {
     pub scanning: u8,
     /// Parallels of a Gaussian grid between a pole and the equator.
     pub parallels: Option<u32>,
+    pub mapping: Option<Mapping>,
 }
 
 impl Grid {
     pub fn of(corners: Corners) -> Self {
-        let Corners { count: [nx, ny], first, last, scanning, parallels } = corners;
+        let Corners { count: [nx, ny], first, last, scanning, parallels, mapping } = corners;
         if nx == 0 || ny == 0 || nx > MAX_NODES || ny > MAX_NODES {
             return Self::Other(format!("its grid has {nx} x {ny} nodes; accepted are 1 to {MAX_NODES} along each axis"));
         }
@@ -103,17 +139,47 @@ impl Grid {
             None => Axis::Even { first: first[1], last: last[1], count: ny, longitude: false },
             Some(parallels) => Axis::Gaussian { parallels, first: first[1], last: last[1], count: ny },
         };
-        Self::Regular(Regular { x, y, scanning })
+        Self::Regular(Regular { x, y, scanning, mapping })
     }
 
-    /// The grid with the latitudes of a Gaussian one, which are costly to compute.
+    /// A plane with the steps `step` (thousandths of a metre) from its first node.
+    fn of_plane(count: [u32; 2], first: [i64; 2], step: [u32; 2], scanning: u8, mapping: Mapping) -> Self {
+        // The limits of other grids.
+        match Self::of(Corners { count, first, last: first, scanning, parallels: None, mapping: None }) {
+            Self::Regular(_) if step.contains(&0) => Self::Other("its nodes lie on each other".into()),
+            Self::Regular(_) => {
+                let sign = [if scanning & 0x80 == 0 { 1 } else { -1 }, if scanning & 0x40 == 0 { -1 } else { 1 }];
+                let axis = |k: usize| Axis::Plane { first, step: sign[k] * i64::from(step[k]), count: count[k] };
+                Self::Regular(Regular { x: axis(0), y: axis(1), scanning, mapping: Some(mapping) })
+            }
+            refused => refused,
+        }
+    }
+
+    /// True if its coordinates are not computed yet.
+    pub fn is_open(&self) -> bool {
+        matches!(self, Self::Regular(Regular { y: Axis::Gaussian { .. } | Axis::Plane { .. }, .. }))
+    }
+
+    /// The grid with the latitudes of a Gaussian one, which are costly to compute, or the coordinates of a projection.
     pub fn resolved(self) -> Self {
         match self {
-            Self::Regular(Regular { x, y: Axis::Gaussian { parallels, first, last, count }, scanning }) => {
+            Self::Regular(Regular { x, y: Axis::Gaussian { parallels, first, last, count }, scanning, mapping }) => {
                 match gaussian(parallels, count as usize, first, last) {
-                    Ok(latitudes) => Self::Regular(Regular { x, y: Axis::of(latitudes), scanning }),
+                    Ok(latitudes) => Self::Regular(Regular { x, y: Axis::of(latitudes), scanning, mapping }),
                     Err(what) => Self::Other(what),
                 }
+            }
+            Self::Regular(Regular { x: x @ Axis::Plane { first, .. }, y, scanning, mapping: Some(mapping) }) => {
+                let numbers = mapping.numbers();
+                let of = |name: &str| numbers.iter().find(|(n, _)| *n == name).map_or(&[][..], |(_, values)| values);
+                let origin = Projection::of(mapping.kind, of, 1.0).and_then(|plane| plane.in_plane(first.map(|angle| angle as f64 / 1e6)));
+                let Some(origin) = origin else { return Self::Other("its first node lies nowhere in its projection".into()) };
+                let listed = |axis: &Axis, origin: f64| match axis {
+                    Axis::Plane { step, count, .. } => Axis::of((0..*count).map(|i| origin + *step as f64 / 1e3 * f64::from(i))),
+                    known => known.clone(),
+                };
+                Self::Regular(Regular { x: listed(&x, origin[0]), y: listed(&y, origin[1]), scanning, mapping: Some(mapping) })
             }
             grid => grid,
         }
@@ -134,7 +200,14 @@ impl Grid {
         }
         let degrees = |at: usize| i64::from(signed(&section[at..at + 3])) * 1000;
         let parallels = (kind == 4).then(|| unsigned(&section[25..27]));
-        Self::of(Corners { count, first: [degrees(13), degrees(10)], last: [degrees(20), degrees(17)], scanning: section[27], parallels })
+        Self::of(Corners {
+            count,
+            first: [degrees(13), degrees(10)],
+            last: [degrees(20), degrees(17)],
+            scanning: section[27],
+            parallels,
+            mapping: None,
+        })
     }
 
     /// Section 3 of edition 2.
@@ -146,8 +219,14 @@ impl Grid {
         if let Some(what) = other_edition2(template) {
             return Self::Other(what);
         }
-        if section.len() < 72 {
-            return Self::Other(format!("its description of a grid has {} bytes; 72 are needed", section.len()));
+        let needed = match template {
+            1 => 84,
+            20 => 65,
+            30 => 81,
+            _ => 72,
+        };
+        if section.len() < needed {
+            return Self::Other(format!("its description of a grid has {} bytes; {needed} are needed", section.len()));
         }
         let number = |at: usize| unsigned(&section[at..at + 4]);
         let count = [number(30), number(34)];
@@ -163,13 +242,28 @@ impl Grid {
                 _ => (value as f64 * f64::from(basic) / f64::from(parts) * 1e6).round() as i64,
             }
         };
-        let grid = Self::of(Corners {
-            count,
-            first: [degrees(50), degrees(46)],
-            last: [degrees(59), degrees(55)],
-            scanning: section[71],
-            parallels: (template == 40).then(|| number(67)),
-        });
+        let grid = match template {
+            10 | 20 | 30 => Self::of_projection(template, count, section),
+            _ => {
+                let rotated = (template == 1).then(|| {
+                    // The poles of the rotated grid lie opposite of each other.
+                    let pole = [degrees(76) as f64 / 1e6 + 180.0, -degrees(72) as f64 / 1e6];
+                    let numbers: [(_, &[f64]); 2] = [("grid_north_pole_longitude", &pole[..1]), ("grid_north_pole_latitude", &pole[1..])];
+                    Mapping::new(ROTATED_POLE, section[54] & ALONG_GRID != 0, &numbers)
+                });
+                if template == 1 && number(80) != 0 {
+                    return Self::Other(ROTATED.into());
+                }
+                Self::of(Corners {
+                    count,
+                    first: [degrees(50), degrees(46)],
+                    last: [degrees(59), degrees(55)],
+                    scanning: section[71],
+                    parallels: (template == 40).then(|| number(67)),
+                    mapping: rotated,
+                })
+            }
+        };
         match grid {
             Self::Regular(regular) if regular.points() as u64 != u64::from(number(6)) => {
                 Self::Other(format!("its grid of {} x {} nodes is said to have {}", count[0], count[1], number(6)))
@@ -177,6 +271,69 @@ impl Grid {
             grid => grid,
         }
     }
+}
+
+/// Vectors run along rows and columns (flag table 3.3 of edition 2).
+const ALONG_GRID: u8 = 0x08;
+
+impl Grid {
+    /// Templates 3.10, 3.20 and 3.30 of edition 2.
+    fn of_projection(template: u32, count: [u32; 2], section: &[u8]) -> Self {
+        let degrees = |at: usize| f64::from(signed(&section[at..at + 4])) / 1e6;
+        let number = |at: usize| unsigned(&section[at..at + 4]);
+        let Some(axes) = axes_of_earth(section) else {
+            return Self::Other(format!(
+                "the shape of its earth is number {} of code table 3.2, which is not understood here",
+                section[14]
+            ));
+        };
+        let along_grid = section[46] & ALONG_GRID != 0;
+        let first = [i64::from(signed(&section[42..46])), i64::from(signed(&section[38..42]))];
+        let globe: [(_, &[f64]); 2] = [("semi_major_axis", &axes[..1]), ("semi_minor_axis", &axes[1..])];
+        let true_at = [degrees(47)];
+        let mapping = |kind, numbers: &[(&'static str, &[f64])]| Mapping::new(kind, along_grid, &[&globe[..], numbers].concat());
+        if template == 10 {
+            let numbers: [(_, &[f64]); 2] = [("standard_parallel", &true_at), ("longitude_of_projection_origin", &[first[0] as f64 / 1e6])];
+            if number(60) != 0 {
+                return Self::Other(projected("turned Mercator"));
+            }
+            return Self::of_plane(count, first, [number(64), number(68)], section[59], mapping("mercator", &numbers));
+        }
+        let (meridian, step, scanning) = ([degrees(51)], [number(55), number(59)], section[64]);
+        let is_south = section[63] & 0x80 != 0;
+        if template == 20 {
+            let pole = [if is_south { -90.0 } else { 90.0 }];
+            let numbers: [(_, &[f64]); 3] = [
+                ("straight_vertical_longitude_from_pole", &meridian),
+                ("latitude_of_projection_origin", &pole),
+                ("standard_parallel", &true_at),
+            ];
+            return Self::of_plane(count, first, step, scanning, mapping("polar_stereographic", &numbers));
+        }
+        let parallels = [degrees(65), degrees(69)];
+        let numbers: [(_, &[f64]); 3] =
+            [("standard_parallel", &parallels), ("latitude_of_projection_origin", &true_at), ("longitude_of_central_meridian", &meridian)];
+        Self::of_plane(count, first, step, scanning, mapping("lambert_conformal_conic", &numbers))
+    }
+}
+
+/// Semi-axes of the earth, metres (code table 3.2 of edition 2).
+fn axes_of_earth(section: &[u8]) -> Option<[f64; 2]> {
+    let scaled = |at: usize| f64::from(unsigned(&section[at + 1..at + 5])) / 10f64.powi(section[at].into());
+    let found = match section[14] {
+        0 => [6_367_470.0; 2],
+        1 => [scaled(15); 2],
+        2 => [6_378_160.0, 6_356_775.0],
+        3 => [1e3 * scaled(20), 1e3 * scaled(25)],
+        4 => [6_378_137.0, 6_356_752.314],
+        5 => [6_378_137.0, 6_356_752.314_2],
+        6 => [6_371_229.0; 2],
+        7 => [scaled(20), scaled(25)],
+        8 => [6_371_200.0; 2],
+        _ => return None,
+    };
+    // Other numbers are damaged.
+    found.iter().all(|axis| (6e6..=6.8e6).contains(axis)).then_some(found)
 }
 
 const REGRID: &str = "write it on regular longitudes and latitudes, for example with `cdo -f nc remapbil,r720x361 IN OUT`";
@@ -217,11 +374,11 @@ fn other_edition1(kind: u8) -> Option<String> {
 /// Why a grid cannot be read (code table 3.1 of edition 2).
 fn other_edition2(template: u32) -> Option<String> {
     Some(match template {
-        0 | 40 => return None,
-        1..=3 | 41..=43 => ROTATED.into(),
-        10 | 12 | 13 => projected("Mercator"),
-        20 | 23 => projected("polar stereographic"),
-        30 | 31 | 33 | 140 => projected("Lambert"),
+        0 | 1 | 10 | 20 | 30 | 40 => return None,
+        2 | 3 | 41..=43 => ROTATED.into(),
+        12 | 13 => projected("Mercator"),
+        23 => projected("polar stereographic"),
+        31 | 33 | 140 => projected("Lambert"),
         50..=53 | 61..=63 => SPECTRAL.into(),
         90 => unread("the view from a satellite"),
         100 | 101 => unread("made of triangles"),
