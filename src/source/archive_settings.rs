@@ -137,7 +137,7 @@ pub struct ArchiveSettings {
     pub u: Option<String>,
     /// Variable of the velocity along y (northward).
     pub v: Option<String>,
-    /// Variable of the velocity along the level axis; `"none"` ignores vertical motion.
+    /// Variable of the velocity along the level axis; `"none"` ignores vertical motion, `"continuity"` computes it.
     pub w: Option<String>,
     /// Coordinate variable (or dimension) of x.
     pub x: Option<String>,
@@ -206,7 +206,27 @@ pub struct ArchiveSettings {
 /// Quantities whose unit can be stated.
 pub const WITH_UNITS: [&str; 7] = ["u", "v", "w", "x", "y", "z", "time"];
 
+/// Value of `archive.w` that ignores vertical motion.
+const NO_W: &str = "none";
+/// Value of `archive.w` that computes vertical motion from the horizontal one.
+const CONTINUITY: &str = "continuity";
+
 impl ArchiveSettings {
+    /// True if vertical motion is computed from the horizontal one.
+    pub(super) fn wants_continuity(&self) -> bool {
+        self.w.as_deref() == Some(CONTINUITY)
+    }
+
+    /// True if no vertical velocity of the files is read.
+    pub(super) fn leaves_out_w(&self) -> bool {
+        self.wants_continuity() || self.w.as_deref() == Some(NO_W)
+    }
+
+    /// Variable of w that is named.
+    pub(super) fn named_w(&self) -> Option<&str> {
+        self.w.as_deref().filter(|_| !self.leaves_out_w())
+    }
+
     /// Unit that is stated for one of [`WITH_UNITS`].
     pub(super) fn unit(&self, of: &str) -> Option<&str> {
         self.units.as_ref()?.get(of).map(String::as_str)

@@ -14,6 +14,7 @@
 mod archive;
 mod archive_settings;
 mod cf;
+mod continuity;
 mod error;
 mod formats;
 mod georeference;

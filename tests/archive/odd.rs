@@ -286,3 +286,26 @@ fn levels_without_a_vertical_velocity_suggest_one_of_them() {
     let said = notes(&archive);
     assert!(said.contains("mostly the shear between them; one level alone is read with --set archive.level=0.5"), "{said}");
 }
+
+#[test]
+fn vertical_motion_is_computed_where_it_is_asked_for() {
+    let dir = tempdir().unwrap();
+    let file = |name: &str, units: &str, levels: &[f64]| {
+        let axes: [(&str, &str, &[f64]); 4] = [("time", HOURS, &[0.0, 1.0]), ("lev", units, levels), ("y", "m", &X), ("x", "m", &X)];
+        let u = |i: usize| (1 + i / 27) as f64 * 0.25 * X[i % 3];
+        let fixture = Fixture::on(CLASSIC, &axes).winds(f32s((0..54).map(u).collect()), f32s(vec![0.5; 54]));
+        fixture.write(&dir.path().join(name))
+    };
+    let deep = file("deep.nc", "m", &[-30.0, -10.0, 0.0]);
+    let mut archive = open_with(&[&deep], "w = \"continuity\"");
+    assert!(notes(&archive).contains("computed from continuity, as set"), "{}", notes(&archive));
+    let up: Vec<f32> = archive.read(1).unwrap().nodes.iter().step_by(9).map(|node| node[2]).collect();
+    assert_eq!(up, [0.0, -10.0, -15.0]);
+    let scaled: Vec<f32> =
+        open_with(&[&deep], "w = \"continuity\"\nvertical_scale = 10.0").read(1).unwrap().nodes.iter().step_by(9).map(|n| n[2]).collect();
+    assert_eq!(scaled, [0.0, -100.0, -150.0]);
+    let pieces = ["`w`", "\"continuity\" with levels in metres"];
+    refused(&[&deep], "w = \"continuity\"\nlevel = -10.0", &pieces);
+    refused(&[&deep], "w = \"continuity\"\nmetric = \"index\"", &pieces);
+    refused(&[&file("air.nc", "hPa", &[500.0, 700.0, 850.0])], "w = \"continuity\"", &pieces);
+}

@@ -10,6 +10,7 @@ use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::calendar::Calendar;
 use crate::cf::coordinate::Kind;
 use crate::cf::velocity::judge;
+use crate::continuity::vertical_velocity;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::georeference::Georeference;
@@ -541,6 +542,9 @@ impl Archive {
             }
         }
         self.poles.extend(&mut components, self.axes[0].axis.coordinates(), self.axes[1].order.len());
+        if self.settings.wants_continuity() {
+            components.push(vertical_velocity(&self.grid, &components[0], &components[1]));
+        }
         Ok(components)
     }
 

@@ -3,7 +3,7 @@
 use crate::archive_settings::{ArchiveSettings, Metric, Staggering, WITH_UNITS};
 use crate::error::SourceError;
 use crate::formats::Format;
-use crate::grids::{Layout, Resampling};
+use crate::grids::{Layout, Quantity, Resampling};
 
 /// Longest wait for a further snapshot, in seconds: four months.
 const MOST_FOLLOWED: f64 = 1e7;
@@ -73,6 +73,9 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, from_ground: bool,
     };
     let terrain = staggered || layout.frames[0].iter().any(|component| component.columns.is_some());
     let own_axes = layout.frames[0].iter().any(|component| component.own.iter().any(Option::is_some));
+    // Pressures have factors that differ from level to level.
+    let metres = layout.axes.len() > 2 && layout.axes[2].quantity == Quantity::Length && layout.vertical.windows(2).all(|w| w[0] == w[1]);
+    let closes = metres && layout.metric != Metric::Index && !staggered;
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
         ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
@@ -86,6 +89,12 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, from_ground: bool,
             s.staggering != Staggering::default(),
             staggered || own_axes,
             "with components that have own coordinates, as in WRF output, only",
+        ),
+        (
+            "w",
+            s.wants_continuity(),
+            closes,
+            "\"continuity\" with levels in metres, in the sphere and cartesian metrics, and not with WRF output",
         ),
         ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),

@@ -34,14 +34,14 @@ fn fixed(listing: &Listing) -> Vec<(String, Vec<usize>)> {
 /// One component alone whose times are not understood.
 pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Result<Option<Content>, SourceError> {
     let listing = &file.listing;
-    let found: Vec<(usize, Component)> = match settings.w.as_deref() {
-        _ if !listing.format.names_dimensions() => return Ok(None),
-        ignored => (0..listing.variables.len())
-            .filter_map(|i| judge(listing, i, settings.velocity_units()).ok().map(|c| (i, c.component)))
-            .filter(|(_, component)| *component != Component::W || ignored != Some("none"))
-            .collect(),
-    };
-    let named = [&settings.u, &settings.v, &settings.w].map(|name| name.as_deref().filter(|name| *name != "none"));
+    if !listing.format.names_dimensions() {
+        return Ok(None);
+    }
+    let found: Vec<(usize, Component)> = (0..listing.variables.len())
+        .filter_map(|i| judge(listing, i, settings.velocity_units()).ok().map(|c| (i, c.component)))
+        .filter(|(_, component)| *component != Component::W || !settings.leaves_out_w())
+        .collect();
+    let named = [settings.u.as_deref(), settings.v.as_deref(), settings.named_w()];
     let variable = |k: usize| match named[k] {
         Some(name) => listing.find(name),
         None => found.iter().find(|(_, component)| *component as usize == k).map(|(i, _)| *i),

@@ -170,7 +170,7 @@ impl Planner<'_> {
                 return Ok((interleaved(found, 3), why));
             }
         }
-        match velocity::choose(listing, [None; 3], s.w.as_deref() == Some("none"), [None; 3]) {
+        match velocity::choose(listing, [None; 3], s.leaves_out_w(), [None; 3]) {
             Ok(found) => {
                 let mut components = vec![(found.u.variable, None), (found.v.variable, None)];
                 components.extend(found.w.map(|w| (w.variable, None)));
@@ -194,7 +194,8 @@ impl Planner<'_> {
         let mut lists: Vec<(&str, Numbered)> = Vec::new();
         for (key, name) in [("u", &s.u), ("v", &s.v), ("w", &s.w)] {
             match name.as_deref() {
-                None | Some("none") if key == "w" => {}
+                None if key == "w" => {}
+                Some(_) if key == "w" && s.leaves_out_w() => {}
                 None => {
                     let accepted = "the names of two or three datasets: `u`, `v` and `w`";
                     return Err(SourceError::setting("u", format!("given without `{key}`"), accepted));

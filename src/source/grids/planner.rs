@@ -240,7 +240,9 @@ impl<'a> Planner<'a> {
             Some(ends) => ends.first,
             None => levels.axis.last(),
         });
-        let way = level.map_or_else(String::new, |level| format!("; one level alone is read with --set archive.level={level}"));
+        let way = level.map_or_else(String::new, |level| {
+            format!("; one level alone is read with --set archive.level={level}, and --set archive.w=continuity computes it")
+        });
         self.note(format!(
             "no vertical velocity found: it is taken as 0, and where levels move apart the FTLE is mostly the shear between them{way}"
         ));
@@ -264,7 +266,10 @@ impl<'a> Planner<'a> {
             (Some(w), false) => {
                 self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));
             }
-            (None, true) if self.settings.w.as_deref() == Some("none") => self.note("vertical motion is ignored, as set"),
+            (None, true) if self.settings.wants_continuity() => self.note(
+                "vertical motion is computed from continuity, as set: 0 at the lowest known node of each column, and above it minus the integral of du/dx + dv/dy",
+            ),
+            (None, true) if self.settings.leaves_out_w() => self.note("vertical motion is ignored, as set"),
             (None, true) => self.note_no_vertical(axis),
             (None, false) => {}
         }

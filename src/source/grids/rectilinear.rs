@@ -31,7 +31,7 @@ impl Planner<'_> {
     /// Finds the components of the velocity.
     pub fn velocity(&mut self) -> Result<Velocity, SourceError> {
         let s = self.settings;
-        let ignore_w = s.w.as_deref() == Some("none");
+        let ignore_w = s.leaves_out_w();
         let w = if ignore_w { None } else { self.named("w", &s.w)? };
         let fixed = [self.named("u", &s.u)?, self.named("v", &s.v)?, w];
         let found = velocity::choose(self.listing(), fixed, ignore_w, s.velocity_units()).map_err(|lacking| self.no_velocity(&lacking))?;
