@@ -68,7 +68,7 @@ fn winds(edition: u8) -> Vec<u8> {
         order: if edition == 1 { 0x30 } else { 0 },
         values: (0..12).map(|i| if i == 7 && k > 3 { f64::NAN } else { ((i * 5 + k * 3) % 16) as f64 / 4.0 }).collect(),
         bits: 9,
-        plane: (edition == 2).then(|| cone(k % 2 == 0)),
+        plane: (edition == 2).then(|| cone(k.is_multiple_of(2))),
     };
     (0..8).flat_map(|k| field(k).bytes()).collect()
 }
