@@ -103,8 +103,8 @@ impl Run<'_> {
         if let Some(TrustedError { points, .. }) = few
             && !std::mem::replace(&mut self.progress.has_warned_of_few_points, true)
         {
-            // A share of the points that all miss it with a probability of 5 % (rule of three).
-            let unseen = 100.0 * 3.0 / points as f64;
+            // A share of the points that all miss it with a probability of 5 %.
+            let unseen = 100.0 * (1.0 - 0.05f64.powf(1.0 / points as f64));
             record.warnings.push(format!(
                 "the stated error rests on {points} audit points: where up to {unseen:.0} % of the trusted region errs more, they may miss it; \
                  trust.audit_min_per_cell and trust.audit_share draw more"

@@ -210,7 +210,7 @@ impl Positions {
         let listing = &file.listing;
         let component = &layout.frames[0].first()?;
         // Nodes between the points of the file are none of these.
-        if component.own.iter().any(Option::is_some) {
+        if component.own[..2].iter().any(Option::is_some) {
             return None;
         }
         let velocity = &listing.variables[listing.find(&component.name)?];

@@ -38,11 +38,11 @@ impl GroundToGrid {
         };
         let known = Positions::of(file, layout);
         let projection = Self::projection(file, layout, is_plane, known.as_ref());
-        let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
+        let (xs, ys) = (layout.axes[0].axis.coordinates(), layout.poles.rows_of_file(layout.axes[1].axis.coordinates()));
         let nodes: Vec<[f64; 2]> = ys.iter().flat_map(|&y| xs.iter().map(move |&x| [x, y])).collect();
         let jacobians: Option<Vec<Jacobian>> = match (&projection, &known) {
-            (Some(projection), _) => nodes.into_par_iter().map(|place| projection.jacobian(place)).collect(),
-            (None, Some(known)) => rows(&known.degrees, xs.len()),
+            (Some(projection), _) => some_known(nodes.into_par_iter().map(|place| projection.near(place)).collect()),
+            (None, Some(known)) => some_known(rows(&known.degrees, xs.len())),
             (None, None) => None,
         };
         let by = if projection.is_some() { "the grid mapping" } else { "the longitudes and latitudes of the nodes" };
@@ -69,7 +69,10 @@ impl GroundToGrid {
                     "velocities run along x and y, and are stretched to the metres of the projection by {least:.4} to {most:.4}; --set \
                      archive.grid_relative=false if they run east and north"
                 );
-                let stretches = jacobians.iter().map(scale).map(|scale| [scale, 0.0, 0.0, scale]);
+                let stretches = jacobians.iter().map(|jacobian| {
+                    let [x, y] = along_axes(jacobian);
+                    [x, 0.0, 0.0, y]
+                });
                 Ok(Some((Some(Self::new(stretches)), note)))
             }
             (None, _) => Ok(settings.grid_relative.map(|_| (None, "velocities run along x and y, as set".into()))),
@@ -100,7 +103,7 @@ impl GroundToGrid {
             return None;
         }
         let Some(known) = known else { return Some(projection) };
-        let [xs, ys] = [0, 1].map(|k| layout.axes[k].axis.coordinates());
+        let (xs, ys) = (layout.axes[0].axis.coordinates(), layout.poles.rows_of_file(layout.axes[1].axis.coordinates()));
         let agrees = |i: usize, j: usize| {
             let (Some(found), expected) = (projection.position([xs[i], ys[j]]), known.degrees[j * xs.len() + i]) else { return false };
             let east = (found[0] - expected[0] + 180.0).rem_euclid(360.0) - 180.0;
@@ -118,6 +121,7 @@ impl GroundToGrid {
     /// Turns and stretches the first two components, level after level.
     pub fn apply(&self, components: &mut [Vec<f32>]) {
         let [u, v, ..] = components else { return };
+        debug_assert!(u.len().is_multiple_of(self.matrices.len()), "matrices of another grid");
         for (node, (u, v)) in u.iter_mut().zip(v).enumerate() {
             let [xx, xy, yx, yy] = self.matrices[node % self.matrices.len()];
             (*u, *v) = (xx * *u + xy * *v, yx * *u + yy * *v);
@@ -125,8 +129,19 @@ impl GroundToGrid {
     }
 }
 
+/// Metres along x and along y for a metre on the ground in the direction of these axes.
+fn along_axes([xe, xn, ye, yn]: &Jacobian) -> [f64; 2] {
+    let determinant = (xe * yn - xn * ye).abs();
+    [determinant / yn.hypot(*ye), determinant / xn.hypot(*xe)]
+}
+
+/// `None` if nothing is known at any node. Velocities at nodes that lie nowhere are missing.
+fn some_known(found: Vec<Jacobian>) -> Option<Vec<Jacobian>> {
+    found.iter().any(|jacobian| jacobian[0].is_finite()).then_some(found)
+}
+
 /// Turns at nodes with known longitudes and latitudes, by second-order differences along rows of `width`.
-fn rows(degrees: &[[f64; 2]], width: usize) -> Option<Vec<Jacobian>> {
+fn rows(degrees: &[[f64; 2]], width: usize) -> Vec<Jacobian> {
     let turn = |node: usize| {
         let at = |step: isize| degrees[node.wrapping_add_signed(step)];
         let row = match node % width {
@@ -136,9 +151,7 @@ fn rows(degrees: &[[f64; 2]], width: usize) -> Option<Vec<Jacobian>> {
             column if column + 1 == width => [(at(-1), -4.0), (at(-2), 1.0), (at(0), 3.0)],
             _ => [(at(1), 1.0), (at(-1), -1.0), (at(0), 0.0)],
         };
-        // Velocities at nodes that lie nowhere are missing.
         turned(degrees[node], row).unwrap_or([f64::NAN; 4])
     };
-    let found: Vec<Jacobian> = (0..degrees.len()).map(turn).collect();
-    found.iter().any(|jacobian| jacobian[0].is_finite()).then_some(found)
+    (0..degrees.len()).map(turn).collect()
 }

@@ -85,6 +85,13 @@ impl Projection {
         Some([point.0, point.1]).filter(|place| place.iter().all(|c| c.is_finite()))
     }
 
+    /// How the plane lies at a point, or a kilometre (about a rotated pole, a hundredth of a degree) beside it where it has no east, as at a pole. Not a number
+    /// outside of the projection.
+    pub fn near(&self, [x, y]: [f64; 2]) -> Jacobian {
+        let aside = if matches!(self, Self::Plane { .. }) { 1000.0 } else { 0.01 };
+        self.jacobian([x, y]).or_else(|| self.jacobian([x + aside, y + aside])).unwrap_or([f64::NAN; 4])
+    }
+
     /// How the plane lies at a point. About a rotated pole, x and y are metres on the ground too.
     pub fn jacobian(&self, place: [f64; 2]) -> Option<Jacobian> {
         match self {

@@ -307,5 +307,10 @@ fn vertical_motion_is_computed_where_it_is_asked_for() {
     let pieces = ["`w`", "\"continuity\" with levels in metres"];
     refused(&[&deep], "w = \"continuity\"\nlevel = -10.0", &pieces);
     refused(&[&deep], "w = \"continuity\"\nmetric = \"index\"", &pieces);
+    let degrees: [(&str, &str, &[f64]); 4] =
+        [("time", HOURS, &[0.0, 1.0]), ("lev", "m", &X), ("lat", "degrees_north", &X), ("lon", "degrees_east", &X)];
+    let globe = winds(Fixture::on(CLASSIC, &degrees), 6).write(&dir.path().join("globe.nc"));
+    assert!(notes(&open_with(&[&globe], "w = \"continuity\"")).contains("computed from continuity"));
+    refused(&[&globe], "w = \"continuity\"\nmetric = \"cartesian\"", &pieces);
     refused(&[&file("air.nc", "hPa", &[500.0, 700.0, 850.0])], "w = \"continuity\"", &pieces);
 }

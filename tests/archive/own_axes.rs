@@ -98,7 +98,7 @@ fn each_component_is_interpolated_from_its_own_points() {
     let mut level = open_with(&[&file], "level = -15.0");
     assert_eq!(level.grid().shape(), [7, 5, 1]);
     assert!((level.read(0).unwrap().nodes[0][0] as f64 - linear(0, [50.0, 100.0, -15.0], 0.0)).abs() < 1e-6);
-    refused(&[&file], "metric = \"index\"", &["`UVEL` lies on (T, Z, YC, XG)", "coordinates of its own along x, y and z"]);
+    refused(&[&file], "metric = \"index\"", &["`metric`", "`UVEL` and `VVEL` lie on points of their own", "--set archive.level=VALUE"]);
 }
 
 #[test]
@@ -265,4 +265,44 @@ fn faces_agree_with_an_independent_integration() {
     let (relative, correlation) = report("faces", 3600.0, &pairs);
     // The same interpolant.
     assert!(relative < 1e-6 && correlation > 0.999_999, "{relative} {correlation}");
+}
+
+/// NEMO: u and v have dimensions of their own for the same levels. One level is the same in both.
+#[test]
+fn a_level_is_read_of_each_component() {
+    let dir = tempdir().unwrap();
+    let depths = [5.0, 15.0, 25.0];
+    for is_mesh in [false, true] {
+        let of_v = |depths: &[f64; 3], name: &str| {
+            let (nx, ny) = (6usize, 5usize);
+            let mut fixture = Fixture::new(CLASSIC, &[("time", 2), ("depthu", 3), ("depthv", 3), ("y", ny), ("x", nx)]);
+            fixture = fixture.axis("time", HOURS, &[0.0, 1.0]).axis("depthu", "m", &[5.0, 15.0, 25.0]).with("positive", "down");
+            fixture = fixture.axis("depthv", "m", depths).with("positive", "down");
+            let place = |i: usize| [(i % nx) as f64, 40.0 + (i / nx) as f64];
+            for (k, (name, axis, unit)) in [("nav_lon", "x", "degrees_east"), ("nav_lat", "y", "degrees_north")].into_iter().enumerate() {
+                fixture = match is_mesh {
+                    true => fixture.variable(name, &["y", "x"], f32s((0..nx * ny).map(|i| place(i)[k]).collect())).with("units", unit),
+                    false => fixture.axis(axis, unit, &(0..[nx, ny][k]).map(|i| [0.0, 40.0][k] + i as f64).collect::<Vec<_>>()),
+                };
+            }
+            for (name, level) in [("uo", "depthu"), ("vo", "depthv")] {
+                let values = f32s((0..2 * 3 * nx * ny).map(|i| depths[i / (nx * ny) % 3]).collect());
+                let standard = if name == "uo" { "eastward_sea_water_velocity" } else { "northward_sea_water_velocity" };
+                fixture = fixture.variable(name, &["time", level, "y", "x"], values).with("units", "m/s").with("standard_name", standard);
+            }
+            fixture.write(&dir.path().join(format!("{name}-{is_mesh}.nc")))
+        };
+        let file = of_v(&depths, "same");
+        let read = |toml: &str| {
+            let snapshot = open_with(&[&file], toml).read(1).unwrap();
+            let node = (0..snapshot.nodes.len()).find(|&i| !snapshot.nodes[i][3].is_nan()).unwrap();
+            east_north(&snapshot, node).map(|v| (v * 1e3).round() / 1e3)
+        };
+        assert_eq!(read("level = 25.0"), [25.0, 25.0], "mesh: {is_mesh}");
+        if is_mesh {
+            assert_eq!(read("select = { depthu = 1 }"), [15.0, 15.0]);
+        }
+        let other = of_v(&[4.0, 14.0, 24.0], "other");
+        refused(&[&other], "level = 25.0", &["`vo`", "it has no level at 25 (entry 2 of `depthu`)", "its levels `depthv` are 4, 14, 24"]);
+    }
 }

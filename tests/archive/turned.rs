@@ -93,3 +93,71 @@ fn winds_to_the_east_are_turned_onto_a_projection() {
         assert!(error < 5e-3, "node {i}: {error}");
     }
 }
+
+/// A pole has no east: what lies beside it tells, and all other nodes are as they are.
+#[test]
+fn a_pole_among_the_nodes_of_a_plane_is_no_reason_to_turn_nothing() {
+    let dir = tempdir().unwrap();
+    let x: Vec<f64> = (-3..=3).map(|i| 1e5 * f64::from(i)).collect();
+    let polar = |standard: [&str; 2], name: &str| {
+        let mut fixture = winds([("x", "m", &x), ("y", "m", &x)], standard, |_, _| [3.0, 4.0]);
+        fixture = fixture.variable("crs", &[], Data::F64(vec![0.0])).with("grid_mapping_name", "polar_stereographic");
+        for (key, value) in [
+            ("latitude_of_projection_origin", 90.0),
+            ("straight_vertical_longitude_from_pole", 0.0),
+            ("standard_parallel", 70.0),
+            ("earth_radius", 6.371e6),
+        ] {
+            fixture = fixture.with(key, value);
+        }
+        fixture.write(&dir.path().join(name))
+    };
+    // At the pole, a plane that is true at 70 N is smaller by (1 + sin 70) / 2.
+    let scale = |x: f64, y: f64| {
+        let smaller = (1.0 + 70f64.to_radians().sin()) / 2.0;
+        smaller * (1.0 + (x.hypot(y) / (2.0 * 6.371e6 * smaller)).powi(2))
+    };
+    let east = open(&[polar(EASTWARD, "east.nc")]).read(0).unwrap();
+    let along = open(&[polar(["x_wind", "y_wind"], "along.nc")]).read(0).unwrap();
+    for i in 0..49 {
+        let (px, py) = (x[i % 7], x[i / 7]);
+        let (k, (sine, cosine)) = (scale(px, py), px.atan2(-py).sin_cos());
+        let near =
+            |found: [f32; 4], expected: [f64; 2], tolerance: f64| (0..2).all(|c| (f64::from(found[c]) - expected[c]).abs() < tolerance);
+        assert!(near(along.nodes[i], [3.0 * k, 4.0 * k], 1e-5), "{px} {py}: {:?} {k}", along.nodes[i]);
+        let turned = [k * (3.0 * cosine - 4.0 * sine), k * (3.0 * sine + 4.0 * cosine)];
+        let speed = f64::from(east.nodes[i][0].hypot(east.nodes[i][1]));
+        assert!(
+            if px == 0.0 && py == 0.0 { (speed - 5.0 * k).abs() < 1e-5 } else { near(east.nodes[i], turned, 1e-5) },
+            "{px} {py}: {:?}",
+            east.nodes[i]
+        );
+    }
+}
+
+/// Rows that are added at the rotated poles are no rows of the file.
+#[test]
+fn winds_are_turned_on_a_rotated_grid_around_the_globe() {
+    let dir = tempdir().unwrap();
+    let (x, y): (Vec<f64>, Vec<f64>) =
+        ((0..36).map(|i| 10.0 * f64::from(i)).collect(), (0..18).map(|i| -85.0 + 10.0 * f64::from(i)).collect());
+    let tilt = 39.25f64.to_radians();
+    let mut fixture = winds([("rlon", "degrees", &x), ("rlat", "degrees", &y)], EASTWARD, |x, y| {
+        let (x, y) = (x.to_radians(), y.to_radians());
+        [10.0 * (1.0 - (tilt.cos() * y.cos() * x.cos() + tilt.sin() * y.sin()).powi(2)).sqrt(), 0.0]
+    });
+    fixture = fixture.variable("crs", &[], Data::F64(vec![0.0])).with("grid_mapping_name", "rotated_latitude_longitude");
+    fixture = fixture.with("grid_north_pole_latitude", 39.25).with("grid_north_pole_longitude", -162.0);
+    let snapshot = open(&[fixture.write(&dir.path().join("globe.nc"))]).read(0).unwrap();
+    let grid = snapshot.grid.clone();
+    assert_eq!(grid.shape(), [36, 20, 1]);
+    for (i, node) in snapshot.nodes.iter().enumerate().filter(|(i, _)| (1..19).contains(&(i / 36))) {
+        let [x, y] = [grid.axes[0].coordinates()[i % 36], grid.axes[1].coordinates()[i / 36]].map(f64::to_radians);
+        let (place, axis) = ([y.cos() * x.cos(), y.cos() * x.sin(), y.sin()], [tilt.cos(), 0.0, tilt.sin()]);
+        for k in 0..3 {
+            let (a, b) = ((k + 1) % 3, (k + 2) % 3);
+            let expected = 10.0 * (axis[a] * place[b] - axis[b] * place[a]);
+            assert!((expected - f64::from(node[k])).abs() < 1e-4, "node {i}: {node:?} {expected}");
+        }
+    }
+}

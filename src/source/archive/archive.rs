@@ -340,6 +340,8 @@ impl Archive {
         let region = own_nodes.then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
         let points = |plan: &ComponentPlan| {
             let [x, y] = region.clone().unwrap_or_else(|| [0, 1].map(|k| (0..plan.along(k)).collect()));
+            // Nodes between levels are no entries.
+            let level = if plan.own[2].is_some() { plan.along(2) / 2 } else { level };
             [x, y, vec![level.min(plan.along(2) - 1)]]
         };
         // What cannot be read is reported when it is needed.
@@ -693,8 +695,13 @@ const WINDOW: usize = 64;
 /// Compares what one snapshot needs with the memory that reading may need. The window is compared when a run is set up.
 fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), SourceError> {
     let on_grid = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
-    // Columns are read whole.
-    let whole = |c: &ComponentPlan| [0, 1, 2].iter().fold(1u64, |n, &k| n.saturating_mul(c.along(k) as u64));
+    // Columns and own coordinates are read whole, but for a region.
+    let along = |c: &ComponentPlan, k: usize| match (&c.own[k], layout.axes.get(k)) {
+        (Some(own), _) => own.points(),
+        (None, Some(axis)) if k < 2 && layout.resampling.is_none() => axis.order.len(),
+        _ => c.along(k),
+    };
+    let whole = |c: &ComponentPlan| [0, 1, 2].iter().fold(1u64, |n, &k| n.saturating_mul(along(c, k) as u64));
     let in_file = layout.frames[0].iter().filter(|c| c.is_interpolated()).map(whole).max().unwrap_or(0);
     let nodes = on_grid.max(in_file);
     let what = limits.check(nodes.saturating_mul(NODE_BYTES), &format!("snapshots of {nodes} nodes"));

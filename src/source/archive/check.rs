@@ -1,6 +1,7 @@
 //! Checks of the archive settings: by themselves, and against the files.
 
 use crate::archive_settings::{ArchiveSettings, Metric, Staggering, WITH_UNITS};
+use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
 use crate::formats::Format;
 use crate::grids::{Layout, Quantity, Resampling};
@@ -75,7 +76,9 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, from_ground: bool,
     let own_axes = layout.frames[0].iter().any(|component| component.own.iter().any(Option::is_some));
     // Pressures have factors that differ from level to level.
     let metres = layout.axes.len() > 2 && layout.axes[2].quantity == Quantity::Length && layout.vertical.windows(2).all(|w| w[0] == w[1]);
-    let closes = metres && layout.metric != Metric::Index && !staggered;
+    let in_degrees = layout.axes[0].kind == Kind::Longitude;
+    let in_metres = layout.metric == Metric::Sphere || (layout.metric == Metric::Cartesian && !in_degrees);
+    let closes = metres && in_metres && !staggered;
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
         ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
@@ -94,7 +97,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, from_ground: bool,
             "w",
             s.wants_continuity(),
             closes,
-            "\"continuity\" with levels in metres, in the sphere and cartesian metrics, and not with WRF output",
+            "\"continuity\" with levels in metres, on the sphere or on x and y in metres, and not with WRF output",
         ),
         ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),

@@ -330,21 +330,26 @@ impl Planner<'_> {
             }
         }
 
-        let role = |which: usize, d: usize| match (planes[which].iter().position(|&t| t == d), level) {
-            (Some(k), _) => Role::Axis(k),
-            (None, _) if terrain.as_ref().is_some_and(|t| t.is_along(which, d)) => Role::Axis(2),
-            (None, Some((dimension, index))) if dimension == d => Role::Fixed(index),
-            (None, _) => match self.measured(d).kind {
-                Kind::Time => Role::Time,
-                Kind::Level if three && self.listing().dimensions[d].len > 1 => Role::Axis(2),
-                _ => Role::Fixed(self.entry_of(d)),
-            },
+        let one_level = self.level_of_u(u, level);
+        let role = |which: usize, variable: usize, d: usize| -> Result<Role, SourceError> {
+            let is_wide = self.listing().dimensions[d].len > 1;
+            Ok(match planes[which].iter().position(|&t| t == d) {
+                Some(k) => Role::Axis(k),
+                None if terrain.as_ref().is_some_and(|t| t.is_along(which, d)) => Role::Axis(2),
+                None => match (self.measured(d).kind, one_level) {
+                    (Kind::Time, _) => Role::Time,
+                    (Kind::Level, _) if three && is_wide => Role::Axis(2),
+                    // w is not read in two dimensions.
+                    (Kind::Level, Some(of_u)) if is_wide && which < 2 => Role::Fixed(self.same_level(variable, d, of_u)?),
+                    _ => Role::Fixed(self.entry_of(d)),
+                },
+            })
         };
-        let roles = |(which, candidate): (usize, &Candidate)| -> Vec<(usize, Role)> {
-            self.variable(candidate.variable).dimensions.iter().map(|&d| (d, role(which, d))).collect()
+        let roles = |(which, candidate): (usize, &Candidate)| -> Result<Vec<(usize, Role)>, SourceError> {
+            self.variable(candidate.variable).dimensions.iter().map(|&d| Ok((d, role(which, candidate.variable, d)?))).collect()
         };
         let candidates = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
-        let roles: Vec<Vec<(usize, Role)>> = candidates.enumerate().map(roles).collect();
+        let roles: Vec<Vec<(usize, Role)>> = candidates.enumerate().map(roles).collect::<Result<_, _>>()?;
         let mut components = vec![self.component(&velocity.u, &roles[0], None)?, self.component(&velocity.v, &roles[1], None)?];
         let levels = [0, 1].map(|k| components[k].along(2));
         if levels[0] != levels[1] {

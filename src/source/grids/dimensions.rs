@@ -8,6 +8,8 @@ use crate::formats::{NumberType, Variable};
 
 /// Longest coordinate variable that is read: a damaged header must not exhaust the memory.
 const MAX_COORDINATES: usize = 1 << 26;
+/// Levels that differ by less than this share of the largest are the same: four roundings of f32.
+const SAME_LEVEL: f64 = 4.0 * f32::EPSILON as f64;
 /// Most nodes along an axis: single precision tells no more apart.
 const MAX_NODES: usize = 1 << 24;
 
@@ -184,14 +186,47 @@ impl Planner<'_> {
         let values = self.coordinate_values(coordinate)?;
         let variable = self.variable(coordinate);
         let scale = values.iter().fold(0.0f64, |m, v| m.max(v.abs()));
-        // A difference of four roundings of f32 is the same level.
-        let Some(index) = values.iter().position(|v| (v - wanted).abs() <= 4.0 * f64::from(f32::EPSILON) * scale) else {
+        let Some(index) = values.iter().position(|v| (v - wanted).abs() <= SAME_LEVEL * scale) else {
             let list = values.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
             let units = variable.units().unwrap_or_default();
             return Err(fault("no such level".into(), format!("levels of {file} are {list} {units}")));
         };
         self.note(format!("level {wanted} picked (entry {index} of `{}`)", variable.name));
         Ok(Some((extent.dimension, index)))
+    }
+
+    /// The level of u that is read alone: by `level`, or by an entry that is selected along its levels.
+    pub fn level_of_u(&self, u: usize, level: Option<(usize, usize)>) -> Option<(usize, usize)> {
+        let selected = |&d: &usize| Some((d, self.settings.entry(&self.listing().dimensions[d].name)?));
+        let levels = self.variable(u).dimensions.iter().filter(|&&d| self.measured(d).kind == Kind::Level);
+        level.or_else(|| levels.filter_map(selected).next())
+    }
+
+    /// Entry along the levels of another component that is the level of u which is read alone.
+    ///
+    /// # Errors
+    /// It has no such level.
+    pub fn same_level(&self, variable: usize, dimension: usize, (of_u, entry): (usize, usize)) -> Result<usize, SourceError> {
+        let name = |d: usize| &self.listing().dimensions[d].name;
+        if let Some(selected) = self.settings.entry(name(dimension)) {
+            return Ok(selected);
+        }
+        if dimension == of_u {
+            return Ok(entry);
+        }
+        let values = |d: usize| self.measured(d).coordinate.map(|c| self.coordinate_values(c)).transpose();
+        let (Some(own), Some(levels)) = (values(dimension)?, values(of_u)?) else {
+            let what = format!("nothing tells which of its levels `{}` is entry {entry} of `{}`", name(dimension), name(of_u));
+            return Err(self.misfit(variable, what));
+        };
+        let (wanted, scale) = (levels[entry], own.iter().fold(0.0f64, |m, v| m.max(v.abs())));
+        own.iter().position(|v| (v - wanted).abs() <= SAME_LEVEL * scale).ok_or_else(|| {
+            let list = own.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
+            self.misfit(
+                variable,
+                format!("it has no level at {wanted} (entry {entry} of `{}`): its levels `{}` are {list}", name(of_u), name(dimension)),
+            )
+        })
     }
 
     /// Refuses a variable whose dimensions its file cannot hold, before coordinates are made for them: each, and the last two, of

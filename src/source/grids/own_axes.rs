@@ -43,7 +43,13 @@ impl LinearWeight {
             (above, _) if above == count => Self::at((count - 1) as f64, count),
             (above, _) => {
                 let [a, b] = [coordinates[above - 1], coordinates[above]];
-                Self { first: above - 1, second: above, weight: ((place - a) / (b - a)) as f32 }
+                // A node that is a coordinate but for rounding must not read its neighbour, which may be missing.
+                let weight = match (place - a) / (b - a) {
+                    weight if weight < SAME => 0.0,
+                    weight if weight > 1.0 - SAME => 1.0,
+                    weight => weight as f32,
+                };
+                Self { first: above - 1, second: above, weight }
             }
         }
     }
@@ -81,6 +87,11 @@ impl OwnAxis {
     /// Nodes of the grid.
     pub fn nodes(&self) -> usize {
         self.weights.len()
+    }
+
+    /// Coordinates of the component.
+    pub fn points(&self) -> usize {
+        self.order.len()
     }
 }
 
@@ -121,8 +132,14 @@ pub fn shared(plans: &[AxisPlan], centred: usize, staggering: Staggering) -> Res
         }
         None if kind == Kind::Level => {}
         None => {
-            let low = own.iter().map(|c| c[0]).fold(f64::NEG_INFINITY, f64::max);
-            let high = own.iter().map(|c| c[c.len() - 1]).fold(f64::INFINITY, f64::min);
+            let mut low = own.iter().map(|c| c[0]).fold(f64::NEG_INFINITY, f64::max);
+            let mut high = own.iter().map(|c| c[c.len() - 1]).fold(f64::INFINITY, f64::min);
+            // Beside a pole, a component is that of its last row up to the pole, so that no hole is left there.
+            let ends = nodes.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], node| [a.min(*node), b.max(*node)]);
+            if kind == Kind::Latitude {
+                low = if ends[0] < step - 90.0 && low < 1.5 * step - 90.0 { ends[0] } else { low };
+                high = if ends[1] > 90.0 - step && high > 90.0 - 1.5 * step { ends[1] } else { high };
+            }
             nodes.retain(|node| (low..=high).contains(node));
         }
     }
@@ -227,6 +244,22 @@ mod tests {
         assert_eq!((both.axis.coordinates(), both.axis.period()), (&[0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0][..], Some(360.0)));
         assert_eq!(on_nodes(&own[0], &[0.0, 2.0, 4.0, 8.0])[6..], [8.0, 4.0]);
         assert_eq!(on_nodes(&own[1], &[1.0, 3.0, 5.0, 9.0])[..2], [5.0, 1.0]);
+    }
+
+    #[test]
+    fn rounding_reads_no_neighbour_and_a_row_beside_a_pole_reaches_it() {
+        let weight = LinearWeight::among(&[0.0, 1.0, 2.0], None, 1.000_01);
+        assert_eq!(weight.of(|k| [f32::NAN, 7.0, f32::NAN][k]), 7.0);
+        let weight = LinearWeight::among(&[0.0, 1.0, 2.0], None, 0.999_99);
+        assert_eq!(weight.of(|k| [f32::NAN, 7.0, f32::NAN][k]), 7.0);
+        let rows = |first: f64, count: usize| {
+            let axis = Axis::new("lat", "degrees_north", (0..count).map(|i| first + 10.0 * i as f64).collect()).unwrap();
+            AxisPlan::made(Kind::Latitude, axis, Quantity::Angle)
+        };
+        let (both, own) = shared(&[rows(-85.0, 18), rows(-90.0, 19)], 0, Staggering::Faces).unwrap().unwrap();
+        assert_eq!((both.axis.first(), both.axis.last(), own[0].weights[0].of(|k| k as f32)), (-90.0, 90.0, 0.0));
+        let (part, _) = shared(&[rows(-45.0, 8), rows(-50.0, 9)], 0, Staggering::Faces).unwrap().unwrap();
+        assert_eq!((part.axis.first(), part.axis.last()), (-45.0, 25.0));
     }
 
     #[test]

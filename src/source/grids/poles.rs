@@ -11,6 +11,11 @@ pub struct Poles {
 }
 
 impl Poles {
+    /// Rows that are those of the file, of latitudes to which the poles were added.
+    pub fn rows_of_file(self, latitudes: &[f64]) -> &[f64] {
+        &latitudes[usize::from(self.south)..latitudes.len() - usize::from(self.north)]
+    }
+
     /// Adds the poles that lie less than three quarters of a cell beyond the ends of `latitude`, if `longitude` is periodic.
     pub fn close(longitude: &AxisPlan, latitude: &mut AxisPlan) -> Result<Self, AxisFault> {
         let rows = latitude.axis.coordinates().to_vec();

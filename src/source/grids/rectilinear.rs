@@ -82,14 +82,21 @@ impl Planner<'_> {
         let candidates: Vec<&Candidate> = [Some(&velocity.u), Some(&velocity.v), w_in_use].into_iter().flatten().collect();
         let mut own = vec![extents.clone(); candidates.len()];
         for (which, candidate) in candidates.iter().enumerate().skip(1) {
-            let extents = self.own_extents(candidate.variable, &extents).filter(|own| metric != Metric::Index || *own == extents);
-            own[which] = extents.ok_or_else(|| self.apart(u, candidate.variable))?;
+            let found = self.own_extents(candidate.variable, &extents).ok_or_else(|| self.apart(u, candidate.variable))?;
+            if metric == Metric::Index && found != extents {
+                let names = [u, candidate.variable].map(|i| &self.variable(i).name);
+                let accepted = "metres, or points that all components share: pick a level with --set archive.level=VALUE, or state the unit of the \
+                                levels with --set archive.units.z=m";
+                let found = format!("index, while `{}` and `{}` lie on points of their own", names[0], names[1]);
+                return Err(SourceError::setting("metric", found, accepted));
+            }
+            own[which] = found;
         }
 
         let mut axes = Vec::new();
         let mut places: Vec<[Option<Arc<OwnAxis>>; 3]> = vec![Default::default(); candidates.len()];
         let role = |extent: &Extent| match (place(extent.kind), level) {
-            (_, Some((dimension, index))) if dimension == extent.dimension => Role::Fixed(index),
+            (Some(2), Some((_, index))) => Role::Fixed(index),
             (Some(k), _) => Role::Axis(k),
             (None, _) => Role::Time,
         };
@@ -105,8 +112,17 @@ impl Planner<'_> {
                 _ => {}
             }
         }
-        let roles: Vec<Vec<(usize, Role)>> =
-            own.iter().map(|extents| extents.iter().map(|extent| (extent.dimension, role(extent))).collect()).collect();
+        let mut roles: Vec<Vec<(usize, Role)>> = Vec::new();
+        for (candidate, extents) in candidates.iter().zip(&own) {
+            let own_role = |extent: &Extent| -> Result<Role, SourceError> {
+                Ok(match (role(extent), level) {
+                    (Role::Fixed(_), Some(of_u)) => Role::Fixed(self.same_level(candidate.variable, extent.dimension, of_u)?),
+                    (role, _) => role,
+                })
+            };
+            let of_component = extents.iter().map(|extent| Ok((extent.dimension, own_role(extent)?)));
+            roles.push(of_component.collect::<Result<_, SourceError>>()?);
+        }
         let mut components =
             vec![self.component(&velocity.u, &roles[0], Some(&axes[0]))?, self.component(&velocity.v, &roles[1], Some(&axes[1]))?];
         let of_w = roles.get(2).map_or(&[][..], Vec::as_slice);
@@ -181,6 +197,16 @@ impl Planner<'_> {
             along.iter().map(|(_, extent)| format!("`{}`", self.listing().dimensions[extent.dimension].name)).collect();
         names.dedup();
         let (names, nodes) = (names.join(", "), axis.axis.len());
+        let step = (axis.axis.last() - axis.axis.first()) / (nodes - 1) as f64;
+        let lost = plans.iter().map(|plan| (axis.axis.first() - plan.axis.first()).max(plan.axis.last() - axis.axis.last()));
+        let lost = if axis.axis.period().is_some() { 0.0 } else { lost.fold(0.0, f64::max) };
+        if lost > 3.0 * step {
+            let (low, high, units) = (axis.axis.first(), axis.axis.last(), axis.axis.units());
+            self.note(format!(
+                "WARNING: only the part along {} that all components have is read: {low} to {high} {units}",
+                ["x", "y", "z"][k]
+            ));
+        }
         self.note(match self.settings.staggering {
             Staggering::Faces => format!(
                 "the components have own coordinates along {}: {names}; read on the {nodes} of all, between which each is interpolated linearly from its own \
@@ -304,7 +330,12 @@ impl Planner<'_> {
                 let variable = self.variable(index);
                 // x runs along the last dimension.
                 let along = variable.dimensions[variable.dimensions.len() - 1 - k];
-                let fits = if more == 0 { along == dimension } else { listing.dimensions[along].len == count + 1 };
+                // `xi_u` lies between the points of `xi_rho`.
+                let stem = |d: usize| listing.dimensions[d].name.split_once('_').map(|(stem, _)| stem);
+                let fits = match more {
+                    0 => along == dimension,
+                    _ => listing.dimensions[along].len == count + 1 && stem(along).is_some() && stem(along) == stem(dimension),
+                };
                 if !fits || !self.is_in_metres(classify(variable), index) {
                     continue;
                 }

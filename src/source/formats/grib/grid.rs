@@ -65,9 +65,9 @@ pub enum Axis {
     Even { first: i64, last: i64, count: u32, longitude: bool },
     /// The latitudes of a Gaussian grid from the first to the last (millionths of a degree): see [`Grid::resolved`].
     Gaussian { parallels: u32, first: i64, last: i64, count: u32 },
-    /// x or y of a projection: steps in thousandths of a metre from the first node, which lies at this longitude and latitude (millionths of a degree):
-    /// see [`Grid::resolved`].
-    Plane { first: [i64; 2], step: i64, count: u32 },
+    /// x or y of a projection: steps in thousandths of a metre from the first node, which lies at this longitude and latitude (millionths of a degree) and,
+    /// once that is computed ([`Grid::resolved`]), at the coordinate with these bits.
+    Plane { first: [i64; 2], step: i64, count: u32, origin: Option<u64> },
     /// The bits of each coordinate as `f64`.
     Listed(Vec<u64>),
 }
@@ -96,7 +96,8 @@ impl Axis {
                 }
                 (*first as f64 + step * index as f64) / 1e6
             }
-            Self::Gaussian { .. } | Self::Plane { .. } => f64::NAN,
+            Self::Gaussian { .. } => f64::NAN,
+            Self::Plane { step, origin, .. } => origin.map_or(f64::NAN, f64::from_bits) + *step as f64 / 1e3 * index as f64,
             Self::Listed(values) => f64::from_bits(values[index]),
         }
     }
@@ -149,7 +150,7 @@ impl Grid {
             Self::Regular(_) if step.contains(&0) => Self::Other("its nodes lie on each other".into()),
             Self::Regular(_) => {
                 let sign = [if scanning & 0x80 == 0 { 1 } else { -1 }, if scanning & 0x40 == 0 { -1 } else { 1 }];
-                let axis = |k: usize| Axis::Plane { first, step: sign[k] * i64::from(step[k]), count: count[k] };
+                let axis = |k: usize| Axis::Plane { first, step: sign[k] * i64::from(step[k]), count: count[k], origin: None };
                 Self::Regular(Regular { x: axis(0), y: axis(1), scanning, mapping: Some(mapping) })
             }
             refused => refused,
@@ -158,7 +159,7 @@ impl Grid {
 
     /// True if its coordinates are not computed yet.
     pub fn is_open(&self) -> bool {
-        matches!(self, Self::Regular(Regular { y: Axis::Gaussian { .. } | Axis::Plane { .. }, .. }))
+        matches!(self, Self::Regular(Regular { y: Axis::Gaussian { .. } | Axis::Plane { origin: None, .. }, .. }))
     }
 
     /// The grid with the latitudes of a Gaussian one, which are costly to compute, or the coordinates of a projection.
@@ -175,11 +176,11 @@ impl Grid {
                 let of = |name: &str| numbers.iter().find(|(n, _)| *n == name).map_or(&[][..], |(_, values)| values);
                 let origin = Projection::of(mapping.kind, of, 1.0).and_then(|plane| plane.in_plane(first.map(|angle| angle as f64 / 1e6)));
                 let Some(origin) = origin else { return Self::Other("its first node lies nowhere in its projection".into()) };
-                let listed = |axis: &Axis, origin: f64| match axis {
-                    Axis::Plane { step, count, .. } => Axis::of((0..*count).map(|i| origin + *step as f64 / 1e3 * f64::from(i))),
-                    known => known.clone(),
+                let at = |axis: Axis, origin: f64| match axis {
+                    Axis::Plane { first, step, count, .. } => Axis::Plane { first, step, count, origin: Some(origin.to_bits()) },
+                    known => known,
                 };
-                Self::Regular(Regular { x: listed(&x, origin[0]), y: listed(&y, origin[1]), scanning, mapping: Some(mapping) })
+                Self::Regular(Regular { x: at(x, origin[0]), y: at(y, origin[1]), scanning, mapping: Some(mapping) })
             }
             grid => grid,
         }
