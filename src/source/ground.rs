@@ -155,3 +155,22 @@ fn rows(degrees: &[[f64; 2]], width: usize) -> Vec<Jacobian> {
     };
     (0..degrees.len()).map(turn).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_plane_that_is_not_conformal_stretches_its_axes_apart() {
+        // Turned by 30 degrees from east to x; a metre on the ground is 0.9 along x and 1.2 along y.
+        let (sine, cosine) = 30f64.to_radians().sin_cos();
+        let jacobian = [0.9 * cosine, 0.9 * sine, -1.2 * sine, 1.2 * cosine];
+        let [x, y] = along_axes(&jacobian);
+        assert!((x - 0.9).abs() < 1e-12 && (y - 1.2).abs() < 1e-12, "{x} {y}");
+        let mut components = [vec![1.0f32, 0.0], vec![0.0, 1.0]];
+        GroundToGrid::new([jacobian].into_iter()).apply(&mut components);
+        let found = [components[0][0], components[1][0], components[0][1], components[1][1]].map(f64::from);
+        let expected = [jacobian[0], jacobian[2], jacobian[1], jacobian[3]];
+        assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}");
+    }
+}
