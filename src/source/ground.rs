@@ -18,12 +18,17 @@ pub struct GroundToGrid {
 }
 
 impl GroundToGrid {
-    /// What the velocities of an archive's first file need, by the names of the velocity, the grid mapping and the longitudes and latitudes of the nodes; and what
-    /// is done, as a sentence. `None` on grids that run east and north, or over which the file tells nothing.
+    /// What the velocities of an archive's first file need, by the names of the velocity, the grid mapping and the longitudes and latitudes of the nodes
+    /// (`positions`, if they were read already); and what is done, as a sentence. `None` on grids that run east and north, or over which the file tells nothing.
     ///
     /// # Errors
     /// The settings say that velocities run east and north, but the file does not tell where east is.
-    pub fn of(file: &DataFile, layout: &Layout, settings: &ArchiveSettings) -> Result<Option<(Option<Self>, String)>, SourceError> {
+    pub fn of(
+        file: &DataFile,
+        layout: &Layout,
+        settings: &ArchiveSettings,
+        positions: Option<&Positions>,
+    ) -> Result<Option<(Option<Self>, String)>, SourceError> {
         let variable = |name: &str| file.listing.find(name).map(|index| &file.listing.variables[index]);
         let u = layout.frames[0].first().and_then(|component| variable(&component.name));
         let x = variable(layout.axes[0].axis.name());
@@ -36,14 +41,15 @@ impl GroundToGrid {
             (Some(false), _) => Some("as set".to_owned()),
             (None, why) => why,
         };
-        let known = Positions::of(file, layout);
-        let projection = Self::projection(file, layout, is_plane, known.as_ref());
+        let read = if positions.is_none() { Positions::of(file, layout) } else { None };
+        let known = positions.or(read.as_ref());
+        let projection = Self::projection(file, layout, is_plane, known);
         let (xs, ys) = (layout.axes[0].axis.coordinates(), layout.poles.rows_of_file(layout.axes[1].axis.coordinates()));
         let nodes: Vec<[f64; 2]> = ys.iter().flat_map(|&y| xs.iter().map(move |&x| [x, y])).collect();
-        let jacobians: Option<Vec<Jacobian>> = match (&projection, &known) {
+        let jacobians: Option<Vec<Jacobian>> = match (&projection, known) {
             (Some(projection), _) => some_known(nodes.into_par_iter().map(|place| projection.near(place)).collect()),
-            (None, Some(known)) => some_known(rows(&known.degrees, xs.len())),
-            (None, None) => None,
+            (None, Some(known)) if eastward.is_some() => some_known(rows(&known.degrees, xs.len())),
+            (None, _) => None,
         };
         let by = if projection.is_some() { "the grid mapping" } else { "the longitudes and latitudes of the nodes" };
         let scale = |[xe, xn, ye, yn]: &Jacobian| (xe * yn - xn * ye).abs().sqrt();

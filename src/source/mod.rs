@@ -9,7 +9,9 @@
 //! - `cf`: conventions of names, units, calendars, packing
 //! - `formats`: bytes and variables, reached through plain messages; knows no meshes
 //!
-//! Shared by the rooms: the trait [`SnapshotSource`] (`snapshots`), [`SourceError`] (`error`) and the settings.
+//! Shared by the rooms: the trait [`SnapshotSource`] (`snapshots`), [`SourceError`] (`error`), the settings, and the mathematics of projections
+//! (`projection`). Between `archive` and `grids`: what coordinates are called (`georeference`), velocities over the ground on planes (`ground`), and vertical
+//! velocity from the horizontal one (`continuity`).
 
 mod archive;
 mod archive_settings;

@@ -119,12 +119,13 @@ impl Projection {
 }
 
 /// Rotation from east and north at `here` to x and y, where `row` are points along x and the weights of their difference.
-pub fn turned<const N: usize>([longitude, latitude]: [f64; 2], row: [([f64; 2], f64); N]) -> Option<Jacobian> {
-    let point = |[longitude, latitude]: [f64; 2]| {
-        let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
+pub fn turned<const N: usize>(here: [f64; 2], row: [([f64; 2], f64); N]) -> Option<Jacobian> {
+    let angles = |place: [f64; 2]| place.map(|angle| angle.to_radians().sin_cos());
+    let point = |place: [f64; 2]| {
+        let [(sin_lon, cos_lon), (sin_lat, cos_lat)] = angles(place);
         [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
     };
-    let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
+    let [(sin_lon, cos_lon), (sin_lat, cos_lat)] = angles(here);
     let along = |direction: [f64; 3]| {
         let rise = |end: [f64; 2]| point(end).iter().zip(direction).map(|(p, d)| p * d).sum::<f64>();
         row.iter().map(|&(end, weight)| weight * rise(end)).sum::<f64>()
@@ -167,7 +168,7 @@ mod tests {
         close(from_rotated([7.0, 3.0], [180.0, 90.0]), [367.0, 3.0], 1e-9);
     }
 
-    /// Snyder, Map projections: a working manual (1987), pages 264 to 316: worked examples; scales from closed forms.
+    /// Against closed forms (Snyder, Map projections: a working manual, USGS professional paper 1395, 1987).
     #[test]
     fn planes_are_turned_and_stretched() {
         // Polar stereographic sphere: meridian 0 runs down from the pole, east is (cos, sin) and the scale 2 / (1 + sin latitude).

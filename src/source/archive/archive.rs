@@ -154,8 +154,8 @@ impl Archive {
                 }
                 Err(error) => return Err(error),
             };
-            let own_levels = layout.frames.iter().flatten().all(|component| !component.is_interpolated());
-            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && own_levels && file.listing.format == Format::NetCdf4
+            let at_points = layout.frames.iter().flatten().all(|component| !component.is_interpolated());
+            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && at_points && file.listing.format == Format::NetCdf4
             {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
@@ -177,7 +177,7 @@ impl Archive {
                     }
                     format = file.listing.format;
                     georeference = Georeference::of(&file, &layout, settings);
-                    (ground_to_grid, ground_note) = GroundToGrid::of(&file, &layout, settings)?.unzip();
+                    (ground_to_grid, ground_note) = GroundToGrid::of(&file, &layout, settings, georeference.positions.as_ref())?.unzip();
                     first = Some(layout);
                 }
             }

@@ -225,9 +225,8 @@ impl Planner<'_> {
         }
     }
 
-    /// Degrees at all points of a coordinate, or at those of one row if it has two dimensions.
-    pub fn degrees(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
-        let variable = self.variable(index);
+    /// Values of a coordinate along its last two dimensions (or its one), or along one row of them.
+    pub fn plane(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
         let mut count = self.shape(index);
         let rank = count.len();
         count[..rank.saturating_sub(2)].fill(1);
@@ -236,11 +235,17 @@ impl Planner<'_> {
             (start[rank - 2], count[rank - 2]) = (row, 1);
         }
         let packing = self.packing(index)?;
+        Ok(self.file.read(index, start, count)?.into_iter().map(|v| packing.unpack(v)).collect())
+    }
+
+    /// The same in degrees.
+    pub fn degrees(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
+        let variable = self.variable(index);
         // MPAS writes radians, and may not say so.
         let is_mpas = ["loncell", "latcell"].contains(&variable.name.to_ascii_lowercase().as_str());
         let radians = variable.units().map_or(is_mpas, |u| u.to_ascii_lowercase().starts_with("rad"));
         let degrees = |v: f64| if radians { v.to_degrees() } else { v };
-        Ok(self.file.read(index, start, count)?.into_iter().map(|v| degrees(packing.unpack(v))).collect())
+        Ok(self.plane(index, row)?.into_iter().map(degrees).collect())
     }
 
     /// Refuses a later file whose points differ from those of the first. Compares the first and the last row, which cost little to

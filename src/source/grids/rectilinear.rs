@@ -342,7 +342,7 @@ impl Planner<'_> {
                 let shape = self.shape(index);
                 let [rows, width] = [shape[shape.len() - 2], shape[shape.len() - 1]];
                 listing.check_count(variable, &[rows, width])?;
-                let plane = self.plane(index)?;
+                let plane = self.plane(index, None)?;
                 let values: Vec<f64> = if k == 0 { plane[..width].to_vec() } else { plane.iter().step_by(width).copied().collect() };
                 let range = values.iter().fold(0.0f64, |m, v| m.max((v - values[0]).abs()));
                 let is_alike = |(i, v): (usize, &f64)| (v - values[if k == 0 { i % width } else { i / width }]).abs() <= 1e-6 * range;
@@ -362,15 +362,6 @@ impl Planner<'_> {
             Some(unit) => unit.is_dimensionless() && matches!(kind, Kind::X | Kind::Y),
             None => self.axis_units(kind, index).is_none() && matches!(kind, Kind::X | Kind::Y),
         }
-    }
-
-    /// Values of a coordinate along its last two dimensions.
-    fn plane(&self, index: usize) -> Result<Vec<f64>, SourceError> {
-        let mut count = self.shape(index);
-        let rank = count.len();
-        count[..rank - 2].fill(1);
-        let packing = self.packing(index)?;
-        Ok(self.file.read(index, vec![0; rank], count)?.into_iter().map(|v| packing.unpack(v)).collect())
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {
