@@ -18,6 +18,8 @@ namespace rw {
 constexpr int BRICK = 8;                 // cells along the edge of a brick
 constexpr float OPAQUE = 1e-4f;          // transmittance below which a ray ends
 constexpr float MOST_POINTS = 65536.0f;  // of quadrature on a ray
+constexpr uint32_t FIRST_AUDIT_RAY = 0x80000000u;  // from here on rays of audits, in nets
+constexpr uint32_t NET = 16;             // rays of a net
 
 // Threads of a block that work in phases on shared memory. As host C++ a phase is a loop.
 struct Block {
@@ -360,15 +362,20 @@ RW_FN void fill_node(const FrameScene& scene, const March& march, uint32_t index
 }
 
 // Offset of a ray across (axis 0) or down (1) its pixel: in fours, a point and its quarter turns around the centre. The first point is that of Gauss's
-// rule, the others are those of an additive recurrence in two dimensions.
-RW_FN float ray_offset(uint32_t ray, int axis) {
+// rule, the others are those of an additive recurrence in two dimensions. Those of audits are four in each net, one in each row and column, shifted by
+// `random`.
+RW_FN float ray_offset(uint32_t ray, int axis, const float random[2]) {
     const double gauss = 0.2886751345948129, sqrt_2 = 1.4142135623730951, sqrt_3 = 1.7320508075688772;
     const uint32_t number = ray / 4;
     const bool turned = ray / 2 % 2 == 1;
     // A turn makes -y of x and x of y.
     const bool along_x = (axis == 0) != turned;
     double point = -gauss;
-    if (number > 0) {
+    if (ray >= FIRST_AUDIT_RAY) {
+        const uint32_t column = number % (NET / 4);
+        const double x = 0.25 * double(along_x ? column : column % 2 * 2 + column / 2) + double(random[along_x ? 0 : 1]);
+        point = x - floor_(x) - 0.5;
+    } else if (number > 0) {
         const double x = along_x ? 0.57 + double(number - 1) * sqrt_2 : 0.81 + double(number - 1) * sqrt_3;
         point = x - floor_(x) - 0.5;
     }
@@ -399,15 +406,18 @@ struct Ray {
 
 // Ray `number` of a pixel, with steps of at most `longest` scene units. Returns false if it misses the box.
 RW_FN bool begin_ray(const FrameScene& scene, bool shifted, uint32_t pixel, uint32_t number, float longest, Ray& ray) {
-    // Quadrature points are in the middle of their steps.
-    float offset[3] = {ray_offset(number, 0), ray_offset(number, 1), 0.5f};
-    if (shifted) {
+    const bool of_audit = number >= FIRST_AUDIT_RAY;
+    float drawn[3] = {0.0f, 0.0f, 0.0f};
+    if (shifted || of_audit) {
         // No path draws in this dimension.
-        const Words random = words(scene.random, pixel, number, 0xFFFFFFFEu);
-        for (int k = 0; k < 3; ++k) {
-            const float moved = offset[k] + unit(random.w[k]);
-            offset[k] = moved - floor_(moved);
-        }
+        const Words random = words(scene.random, pixel, of_audit ? number - number % NET : number, 0xFFFFFFFEu);
+        for (int k = 0; k < 3; ++k) drawn[k] = unit(random.w[k]);
+    }
+    // Quadrature points are in the middle of their steps.
+    float offset[3] = {ray_offset(number, 0, drawn), ray_offset(number, 1, drawn), 0.5f};
+    for (int k = of_audit ? 2 : 0; shifted && k < 3; ++k) {
+        const float moved = offset[k] + drawn[k];
+        offset[k] = moved - floor_(moved);
     }
     const uint32_t column = pixel % scene.width, row = pixel / scene.width;
     const double x = ((double)column + (double)offset[0]) / (double)scene.width * 2.0 - 1.0;

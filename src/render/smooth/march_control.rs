@@ -21,8 +21,10 @@ const SPARE: f64 = 0.25;
 const MIN_AUDITS: u64 = 4;
 /// Pixels per audit. Most of the error is at edges, in few of them.
 const AUDITED_PIXELS: u64 = 1024;
-/// Rays of an audit that follow those it compares. They share no coordinate with them, so that edges along the axes show too.
-pub const AUDIT_RAYS: u64 = 32;
+/// Numbers from which on the rays of audits count. No picture has as many.
+pub const FIRST_AUDIT_RAY: u64 = 1 << 31;
+/// Rays of each of the two nets of an audit.
+pub const NET: u64 = 16;
 /// Steps of an audit in one step of the march.
 pub const AUDIT_STEPS: u64 = 4;
 /// Number of lit pixels of an audit in which the depth to the light is marched, which takes long.
@@ -33,14 +35,15 @@ pub const LIGHT_STEPS: u64 = 2;
 const AUDIT_DIMENSION: u32 = u32::MAX - 2;
 
 /// An audited pixel: linear radiances, each the mean of some rays.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct AuditedPixel {
-    /// Opacity, the mean over all of its rays.
-    pub alpha: f64,
-    /// The first [`MarchControl::audited_rays`] rays, as marched.
-    pub first: [f64; 3],
-    /// The `AUDIT_RAYS` rays that follow.
-    pub following: [f64; 3],
+    /// Number of the pixel, row by row.
+    pub pixel: u32,
+    /// Radiance and opacity, the mean over all rays of the picture so far.
+    pub shown: [f64; 4],
+    /// Radiances of two nets of rays at independent random places: the product of the differences to them has the square of the pixel filter's error as
+    /// its mean, since their own errors are independent.
+    pub nets: [[f64; 3]; 2],
     /// The first `PAIR` rays, as marched.
     pub pair: [f64; 3],
     /// The same with `AUDIT_STEPS` steps in one.
@@ -52,64 +55,57 @@ pub struct AuditedPixel {
 impl AuditedPixel {
     /// Errors are stated over lit pixels, so that others do not count.
     pub fn is_lit(&self) -> bool {
-        self.alpha > f64::from(LIT)
+        self.shown[3] > f64::from(LIT)
     }
 }
 
-/// A mean over audited pixels.
+/// Mean over the channels of a product, in the weightings of [`super::TileErrors`] of a pixel that shows `shown` where `truth` is right.
+fn weighted(a: [f64; 3], b: [f64; 3], tone_map: ToneMap, shown: [f64; 3], truth: [f64; 3]) -> [f64; 3] {
+    let mut sums = [0.0; 3];
+    for k in 0..3 {
+        let (product, slope) = (a[k] * b[k] / 3.0, f64::from(tone_map.secant(shown[k] as f32, truth[k] as f32)));
+        for (sum, weight) in sums.iter_mut().zip([1.0, 1.0 / (shown[k] * shown[k] + 0.01), slope * slope]) {
+            *sum += product * weight;
+        }
+    }
+    sums
+}
+
+/// A mean over audited pixels, in all weightings.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Mean {
-    sum: f64,
-    squares: f64,
+    sum: [f64; 3],
+    squares: [f64; 3],
     count: f64,
 }
 
 impl Mean {
-    fn add(&mut self, value: f64) {
-        self.sum += value;
-        self.squares += value * value;
+    fn add(&mut self, values: [f64; 3]) {
+        for (w, value) in values.into_iter().enumerate() {
+            self.sum[w] += value;
+            self.squares[w] += value * value;
+        }
         self.count += 1.0;
     }
 
-    fn mean(&self) -> f64 {
-        self.sum / self.count.max(1.0)
+    fn mean(&self, weighting: usize) -> f64 {
+        self.sum[weighting] / self.count.max(1.0)
     }
 
     /// Standard error of the mean. A single value is its own standard error.
-    fn deviation(&self) -> f64 {
-        let (n, mean) = (self.count, self.mean());
-        if n > 1.0 { ((self.squares / n - mean * mean).max(0.0) / (n - 1.0)).sqrt() } else { mean.abs() }
+    fn deviation(&self, weighting: usize) -> f64 {
+        let (n, mean) = (self.count, self.mean(weighting));
+        if n > 1.0 { ((self.squares[weighting] / n - mean * mean).max(0.0) / (n - 1.0)).sqrt() } else { mean.abs() }
     }
 
-    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low.
-    fn bound(&self) -> f64 {
-        self.mean() + self.deviation()
-    }
-}
-
-/// Sums of squared differences in the weightings of [`super::TileErrors`]: their ratios turn a mean square error into a weighted one.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-struct WeightedSquares([f64; 3]);
-
-impl WeightedSquares {
-    fn add(&mut self, tone_map: ToneMap, factor: f64, shown: [f64; 3], truth: [f64; 3]) {
-        for (shown, truth) in shown.into_iter().zip(truth) {
-            let square = factor * (shown - truth).powi(2);
-            let toned = square * f64::from(tone_map.secant(shown as f32, truth as f32)).powi(2);
-            for (sum, value) in self.0.iter_mut().zip([square, square / (shown * shown + 0.01), toned]) {
-                *sum += value;
-            }
-        }
-    }
-
-    /// A mean square error in all weightings.
-    fn weighted(&self, mean_square: f64) -> [f64; 3] {
-        if self.0[0] > 0.0 { self.0.map(|sum| mean_square * sum / self.0[0]) } else { [mean_square; 3] }
+    /// The mean. Below half of its standard error it says no more than that.
+    fn value(&self, weighting: usize) -> f64 {
+        self.mean(weighting).max(0.5 * self.deviation(weighting))
     }
 }
 
 /// State of the march of a picture.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct MarchControl {
     /// Rays per pixel so far.
     pub rays: u64,
@@ -117,16 +113,15 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Squared errors of the pixel filter times its rays, of the steps and of the light volume, and twice the product of the last two.
+    /// Number of audits so far.
+    audits: u64,
+    /// The pixels of these audits.
+    audited: Vec<AuditedPixel>,
+    /// Squared errors of the pixel filter, of the steps and of the light volume, and twice the product of the last two.
     filter: Mean,
     steps: Mean,
     light: Mean,
     both: Mean,
-    /// Weights of the error of the pixel filter, and of that of steps and light volume.
-    filter_weights: WeightedSquares,
-    quadrature_weights: WeightedSquares,
-    /// Number of audits so far.
-    audits: u64,
 }
 
 /// What to do after a round.
@@ -142,30 +137,19 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        let (none, unweighted) = (Mean::default(), WeightedSquares::default());
-        Self {
-            rays: 0,
-            next_rays: MIN_RAYS,
-            step: FIRST_STEP,
-            filter: none,
-            steps: none,
-            light: none,
-            both: none,
-            filter_weights: unweighted,
-            quadrature_weights: unweighted,
-            audits: 0,
-        }
+        let [filter, steps, light, both] = [Mean::default(); 4];
+        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, audits: 0, audited: Vec::new(), filter, steps, light, both }
     }
 }
 
 impl MarchControl {
     /// The control of another picture. The steps of the last one are likely to suit it.
-    pub fn restarted(self) -> Self {
+    pub fn restarted(&self) -> Self {
         Self { step: self.step, ..Self::default() }
     }
 
     /// The control of the same view of other nodes. It gets as many rays at once, so that the picture becomes no coarser than it was.
-    pub fn on_other_nodes(self) -> Self {
+    pub fn on_other_nodes(&self) -> Self {
         Self { next_rays: self.rays.clamp(MIN_RAYS, MAX_RAYS), ..self.restarted() }
     }
 
@@ -179,11 +163,6 @@ impl MarchControl {
         self.next_rays > 0 || self.audits < MIN_AUDITS
     }
 
-    /// Rays of the picture that an audit compares with those that follow.
-    pub fn audited_rays(&self) -> u64 {
-        self.rays.clamp(MIN_RAYS, AUDIT_RAYS)
-    }
-
     /// Pixels of the next audit, others in each.
     pub fn audit_pixels(&mut self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
         let first = self.audits * AUDITED_PIXELS;
@@ -195,66 +174,66 @@ impl MarchControl {
         (0..AUDITED_PIXELS).map(pixel).collect()
     }
 
-    /// Takes in an audited pixel, if it is lit. `tone_map` is that of the picture.
-    pub fn audit(&mut self, pixel: &AuditedPixel, tone_map: ToneMap) {
-        if !pixel.is_lit() {
-            return;
-        }
+    /// The pixels that have been audited. Their `shown` follows the picture.
+    pub fn audited_mut(&mut self) -> &mut [AuditedPixel] {
+        &mut self.audited
+    }
+
+    /// Takes in audited pixels and what all of them show now. `tone_map` is that of the picture.
+    pub fn audit(&mut self, pixels: impl IntoIterator<Item = AuditedPixel>, tone_map: ToneMap) {
+        self.audited.extend(pixels);
+        [self.filter, self.steps, self.light, self.both] = [Mean::default(); 4];
         let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);
-        let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
-        // The rays that follow err too: by at least this share of the error of the first, if errors fall no faster than with the square of the number.
-        let (filter, rays) = (minus(pixel.first, pixel.following), self.audited_rays() as f64);
-        let factor = rays / (1.0 + (rays / AUDIT_RAYS as f64).powi(2));
-        self.filter.add(factor * dot(filter, filter));
-        self.filter_weights.add(tone_map, factor, pixel.first, pixel.following);
-        self.quadrature_weights.add(tone_map, 1.0, pixel.pair, pixel.lit.unwrap_or(pixel.fine));
-        let steps = minus(pixel.pair, pixel.fine);
-        self.steps.add(dot(steps, steps));
-        if let Some(lit) = pixel.lit {
-            let light = minus(pixel.fine, lit);
-            self.light.add(dot(light, light));
-            self.both.add(2.0 * dot(steps, light));
+        for pixel in self.audited.iter().filter(|pixel| pixel.is_lit()) {
+            let [red, green, blue, _] = pixel.shown;
+            let (shown, [one, other]) = ([red, green, blue], pixel.nets);
+            let truth = std::array::from_fn(|k| 0.5 * (one[k] + other[k]));
+            self.filter.add(weighted(minus(shown, one), minus(shown, other), tone_map, shown, truth));
+            let (pair, fine, steps) = (pixel.pair, pixel.fine, minus(pixel.pair, pixel.fine));
+            self.steps.add(weighted(steps, steps, tone_map, pair, fine));
+            if let Some(lit) = pixel.lit {
+                let light = minus(fine, lit);
+                self.light.add(weighted(light, light, tone_map, pair, lit));
+                self.both.add(weighted(steps, light, tone_map, pair, lit).map(|product| 2.0 * product));
+            }
         }
     }
 
     /// Error of the steps and of the light volume together. That they cancel is not trusted, since it was seen on few pixels.
-    fn quadrature(&self) -> f64 {
-        self.steps.bound() + self.light.bound() + self.both.bound().max(0.0)
-    }
-
-    /// Error of the pixel filter, which falls about as that of independent rays or faster.
-    fn filter(&self) -> f64 {
-        self.filter.bound() / self.rays.max(1) as f64
+    fn quadrature(&self, weighting: usize) -> f64 {
+        self.steps.value(weighting) + self.light.value(weighting) + self.both.mean(weighting).max(0.0)
     }
 
     /// Mean square error of marching, mean over channels.
     pub fn error(&self) -> f64 {
-        self.quadrature() + self.filter()
+        self.quadrature(0) + self.filter.value(0)
     }
 
     /// Mean square errors of marching, in all weightings.
     pub fn errors(&self) -> MarchError {
-        let (quadrature, filter) = (self.quadrature_weights.weighted(self.quadrature()), self.filter_weights.weighted(self.filter()));
-        // All are of the same pixels, so that their deviations may add up.
-        let both = if self.both.bound() > 0.0 { self.both.deviation() } else { 0.0 };
-        let deviation = self.steps.deviation() + self.light.deviation() + both + self.filter.deviation() / self.rays.max(1) as f64;
-        MarchError { squared: std::array::from_fn(|w| quadrature[w] + filter[w]), deviation }
+        let deviation = |w: usize| {
+            // Those of steps and light are of the same pixels and may add up.
+            let both = if self.both.mean(w) > 0.0 { self.both.deviation(w) } else { 0.0 };
+            (self.steps.deviation(w) + self.light.deviation(w) + both).hypot(self.filter.deviation(w))
+        };
+        let squared = std::array::from_fn(|w| self.quadrature(w) + self.filter.value(w));
+        MarchError { squared, deviation: std::array::from_fn(deviation) }
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let wanted = self.filter() > SPARE * allowed;
+        let wanted = self.filter.value(0) > SPARE * allowed;
         self.next_rays = if wanted && self.rays < MAX_RAYS { MIN_RAYS } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
-        if self.quadrature() > allowed && self.step > MIN_STEP {
+        if self.quadrature(0) > allowed && self.step > MIN_STEP {
             let next_rays = self.rays.max(MIN_RAYS);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
             return Marching::Anew;
         }
-        if self.filter() > allowed && self.rays < MAX_RAYS {
+        if self.filter.value(0) > allowed && self.rays < MAX_RAYS {
             self.next_rays = self.rays.min(MAX_RAYS - self.rays);
             return Marching::More;
         }

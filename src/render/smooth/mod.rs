@@ -30,7 +30,7 @@ pub use regression::Guides;
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},
-    march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, PAIR},
+    march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
     statement::LIT,
     tone::{ToneMap, squared_slope},

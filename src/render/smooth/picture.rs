@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
-use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, PAIR};
+use super::march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
@@ -187,27 +187,35 @@ impl Picture {
             let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
             rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&ray(j)));
             progress::mark();
-            (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
+            sum.radiance.map(|c| f64::from(c) / count)
         };
-        let (fine, shown) = (step / AUDIT_STEPS as f32, self.march.audited_rays());
+        let per_ray = 1.0 / self.march.rays as f64;
+        let shown = |sum: &RaySum| {
+            let [red, green, blue] = sum.radiance;
+            [red, green, blue, sum.alpha].map(|c| f64::from(c) * per_ray)
+        };
+        let fine = step / AUDIT_STEPS as f32;
         let look = |&pixel: &u32| {
-            let [(first, alpha), (following, more)] = [0..shown, shown..shown + AUDIT_RAYS].map(|rays| mean(rays, &|j| marched(pixel, j)));
-            let alpha = (alpha + more) / (shown + AUDIT_RAYS) as f64;
+            let net = |first: u64| mean(first..first + NET, &|j| marched(pixel, j));
+            let nets = [FIRST_AUDIT_RAY, FIRST_AUDIT_RAY + NET].map(net);
+            let found = AuditedPixel { pixel, shown: shown(&self.base[pixel as usize]), nets, ..AuditedPixel::default() };
             if mended {
                 // What steps and light volume err, mended rays scatter.
-                return AuditedPixel { alpha, first, following, ..AuditedPixel::default() };
+                return found;
             }
-            let [pair, fine] = [step, fine].map(|step| mean(0..PAIR, &|j| medium.ray(pixel, j, step, ToLight::Volume(light), false)).0);
-            AuditedPixel { alpha, first, following, pair, fine, lit: None }
+            let [pair, fine] = [step, fine].map(|step| mean(0..PAIR, &|j| medium.ray(pixel, j, step, ToLight::Volume(light), false)));
+            AuditedPixel { pair, fine, ..found }
         };
         let mut compared: Vec<AuditedPixel> = audited.par_iter().map(look).collect();
-        let mut lit: Vec<(&mut AuditedPixel, u32)> =
-            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit() && !mended).take(LIT_BY_MARCH).collect();
-        lit.par_iter_mut().for_each(|(audited, pixel)| {
+        let mut lit: Vec<&mut AuditedPixel> = compared.iter_mut().filter(|pixel| pixel.is_lit() && !mended).take(LIT_BY_MARCH).collect();
+        lit.par_iter_mut().for_each(|audited| {
             let to_light = ToLight::March(step / LIGHT_STEPS as f32);
-            audited.lit = Some(mean(0..PAIR, &|j| medium.ray(*pixel, j, fine, to_light, false)).0);
+            audited.lit = Some(mean(0..PAIR, &|j| medium.ray(audited.pixel, j, fine, to_light, false)));
         });
-        compared.iter().for_each(|pixel| self.march.audit(pixel, tone_map));
+        for pixel in self.march.audited_mut() {
+            pixel.shown = shown(&self.base[pixel.pixel as usize]);
+        }
+        self.march.audit(compared, tone_map);
         began.elapsed().as_secs_f64()
     }
 

@@ -25,23 +25,22 @@ impl ErrorEstimate {
     }
 }
 
-/// Mean square error of marching over lit pixels and channels.
+/// Mean square error of marching over lit pixels and channels, in the weightings of [`TileErrors`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct MarchError {
-    /// In the weightings of [`TileErrors`]: the mean over audited pixels and its standard error, added up.
+    /// Mean over audited pixels.
     pub squared: [f64; 3],
-    /// Standard error of `squared[0]`, which contains it once.
-    pub deviation: f64,
+    /// Its standard error.
+    pub deviation: [f64; 3],
 }
 
 impl MarchError {
     /// Adds the error of marching, `share` of that of the lit pixels, to another mean square error. Its own interval reaches two standard errors from its
     /// mean.
     fn added_to(&self, other: ErrorEstimate, weighting: usize, share: f64) -> ErrorEstimate {
-        let [linear, squared] = [self.squared[0], share * self.squared[weighting]];
-        let deviation = if linear > 0.0 { self.deviation * squared / linear } else { 0.0 };
+        let [squared, deviation] = [self.squared, self.deviation].map(|of| share * of[weighting]);
         let value = other.value + squared;
-        let (below, above) = ((other.value - other.low).hypot(3.0 * deviation), (other.high - other.value).hypot(deviation));
+        let (below, above) = ((other.value - other.low).hypot(2.0 * deviation), (other.high - other.value).hypot(2.0 * deviation));
         ErrorEstimate { value, low: (value - below).max(0.0), high: value + above }
     }
 }
@@ -212,15 +211,14 @@ mod tests {
 
     #[test]
     fn the_error_of_marching_counts_in_its_own_weighting() {
-        // Mean 3 and standard error 1, twice and half as large in the other weightings.
-        let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: 1.0 };
+        let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: [1.0, 2.0, 0.5] };
         let none = ErrorEstimate::default();
         let found = [0, 1, 2].map(|weighting| march.added_to(none, weighting, 1.0));
         let interval = |value, low, high| ErrorEstimate { value, low, high };
-        assert_eq!(found, [interval(4.0, 1.0, 5.0), interval(8.0, 2.0, 10.0), interval(2.0, 0.5, 2.5)]);
+        assert_eq!(found, [interval(4.0, 2.0, 6.0), interval(8.0, 4.0, 12.0), interval(2.0, 1.0, 3.0)]);
         // Independent errors: half-widths are added in squares.
-        let other = ErrorEstimate { value: 10.0, low: 6.0, high: 10.0 };
-        assert_eq!(march.added_to(other, 0, 1.0), interval(14.0, 9.0, 15.0));
+        let other = ErrorEstimate { value: 10.0, low: 8.5, high: 10.0 };
+        assert_eq!(march.added_to(other, 0, 1.0), interval(14.0, 11.5, 16.0));
         assert_eq!(march.added_to(other, 0, 0.0), other);
     }
 

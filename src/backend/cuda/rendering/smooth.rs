@@ -12,10 +12,11 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, AUDIT_RAYS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH,
-    MarchControl, Marching, PAIR, PictureError, TileSums, ToneMap,
+    AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT, LIT_BY_MARCH,
+    MarchControl, Marching, NET, PAIR, PictureError, TileSums, ToneMap,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -191,34 +192,47 @@ impl GpuSmooth {
         self.march.march(&medium, step, due as u32, round.is_sum())?;
         let random = FrameRandom::new(renderer.scene().seed, self.number);
         let pixels = self.control.audit_pixels(&random, parameters.pixels());
+        let before = self.control.rays;
         self.control.rays += due;
-        let rays = |pixel: u32, count: u64, step: f32, shadow_step: f32| {
-            (0..count).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
+        let now = self.control.rays;
+        let rays = |pixel: u32, rays: Range<u64>, step: f32, shadow_step: f32| {
+            rays.map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
         };
         let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
-        let (shown, pair) = (self.control.audited_rays() as usize, PAIR as usize);
-        let each = shown + AUDIT_RAYS as usize;
-        let coarse = pixels.iter().flat_map(|&pixel| rays(pixel, each as u64, step, 0.0));
-        let checks: Vec<RayCheck> = coarse.chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0))).collect();
+        // Pixels of earlier audits get the new rays, those of this one all rays and two nets.
+        let of_audit = [0..now, FIRST_AUDIT_RAY..FIRST_AUDIT_RAY + 2 * NET];
+        let followed = self.control.audited_mut().iter().flat_map(|audited| rays(audited.pixel, before..now, step, 0.0));
+        let mut checks: Vec<RayCheck> = followed.collect();
+        let [of_followed, each] = [checks.len(), (now + 2 * NET) as usize];
+        checks.extend(pixels.iter().flat_map(|&pixel| of_audit.clone().into_iter().flat_map(move |those| rays(pixel, those, step, 0.0))));
+        checks.extend(pixels.iter().flat_map(|&pixel| rays(pixel, 0..PAIR, fine, 0.0)));
         let found = self.march.check(&medium, &checks, round.is_sum())?;
         fn mean<const N: usize>(rays: &[[f32; 4]]) -> [f64; N] {
             std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
         }
+        let (followed, found) = found.split_at(of_followed);
         let (coarse, finer) = found.split_at(each * pixels.len());
-        let look = |(coarse, fine): (&[[f32; 4]], &[[f32; 4]])| {
-            let (first, following) = coarse.split_at(shown);
-            let [.., alpha] = mean::<4>(coarse);
-            AuditedPixel { alpha, first: mean(first), following: mean(following), pair: mean(&first[..pair]), fine: mean(fine), lit: None }
-        };
-        let mut compared: Vec<AuditedPixel> = coarse.chunks_exact(each).zip(finer.chunks_exact(pair)).map(look).collect();
-        let lit: Vec<usize> = (0..pixels.len()).filter(|&number| compared[number].is_lit()).take(LIT_BY_MARCH).collect();
-        let checks: Vec<RayCheck> = lit.iter().flat_map(|&number| rays(pixels[number], PAIR, fine, to_light)).collect();
-        let found = self.march.check(&medium, &checks, round.is_sum())?;
-        for (&number, rays) in lit.iter().zip(found.chunks_exact(pair)) {
-            compared[number].lit = Some(mean(rays));
+        if due > 0 {
+            for (audited, new) in self.control.audited_mut().iter_mut().zip(followed.chunks_exact(due as usize)) {
+                let new: [f64; 4] = mean(new);
+                (0..4).for_each(|k| audited.shown[k] += (new[k] - audited.shown[k]) * due as f64 / now as f64);
+            }
         }
-        let tone_map = ToneMap::new(renderer.scene().settings.tone_map);
-        compared.iter().for_each(|pixel| self.control.audit(pixel, tone_map));
+        let (net, pair) = (NET as usize, PAIR as usize);
+        let look = |((&pixel, coarse), fine): ((&u32, &[[f32; 4]]), &[[f32; 4]])| {
+            let (shown, nets) = coarse.split_at(now as usize);
+            let nets = [mean(&nets[..net]), mean(&nets[net..])];
+            AuditedPixel { pixel, shown: mean(shown), nets, pair: mean(&shown[..pair]), fine: mean(fine), lit: None }
+        };
+        let mut compared: Vec<AuditedPixel> =
+            pixels.iter().zip(coarse.chunks_exact(each)).zip(finer.chunks_exact(pair)).map(look).collect();
+        let mut lit: Vec<&mut AuditedPixel> = compared.iter_mut().filter(|audited| audited.is_lit()).take(LIT_BY_MARCH).collect();
+        let checks: Vec<RayCheck> = lit.iter().flat_map(|audited| rays(audited.pixel, 0..PAIR, fine, to_light)).collect();
+        let found = self.march.check(&medium, &checks, round.is_sum())?;
+        for (audited, rays) in lit.iter_mut().zip(found.chunks_exact(pair)) {
+            audited.lit = Some(mean(rays));
+        }
+        self.control.audit(compared, ToneMap::new(renderer.scene().settings.tone_map));
         Ok(began.elapsed().as_secs_f64())
     }
 
