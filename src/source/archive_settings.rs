@@ -143,7 +143,7 @@ pub struct ArchiveSettings {
     pub x: Option<String>,
     /// Coordinate variable (or dimension) of y.
     pub y: Option<String>,
-    /// Coordinate variable (or dimension) of the levels.
+    /// Coordinate variable (or dimension) of the levels, or a field of the heights of their points.
     pub z: Option<String>,
     /// Time variable.
     pub time: Option<String>,

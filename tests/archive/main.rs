@@ -5,6 +5,7 @@ mod curvilinear;
 mod followed;
 mod grib;
 mod hdf5;
+mod heights;
 mod hemispheres;
 mod http;
 mod hybrid;

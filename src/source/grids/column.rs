@@ -10,6 +10,9 @@
 //!
 //! Those of the atmosphere (`atmosphere_hybrid_sigma_pressure_coordinate`, `atmosphere_sigma_coordinate`) have the pressure p = a + b p_s, with the
 //! pressure p_s at the ground, whose height is that of the isothermal atmosphere (see [`super::levels`]).
+//!
+//! Other files hold the heights themselves, a number for each point of each level: layers that follow the density, or the last cells above an
+//! uneven bottom.
 
 use super::component::{ComponentPlan, Orders, read_component};
 use super::levels::{REFERENCE_PRESSURE, height_of, pressure_at, upward};
@@ -65,20 +68,35 @@ impl Formula {
     }
 }
 
+/// Where the levels of a column lie.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Places {
+    /// By a formula of the conventions.
+    Formula {
+        formula: Formula,
+        /// The numbers of each level, from the bottom upwards.
+        levels: Vec<[f64; 2]>,
+        /// h_c, metres.
+        critical_depth: f64,
+        /// Depth of the sea, metres, or pressure at the ground, Pa.
+        ground: Box<ComponentPlan>,
+        /// Height of the surface; without it 0.
+        surface: Option<Box<ComponentPlan>>,
+    },
+    /// By a field of their heights (x, y, levels), metres.
+    Field {
+        heights: Box<ComponentPlan>,
+        /// True if they lie above the sea.
+        is_of_air: bool,
+    },
+}
+
 /// Levels of one component, and the heights that it is interpolated to.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Columns {
-    pub formula: Formula,
-    /// The numbers of each level, from the bottom upwards.
-    pub levels: Vec<[f64; 2]>,
-    /// Index in the file of each level.
+    pub places: Places,
+    /// Index in the file of each level, from the bottom upwards.
     pub order: Vec<usize>,
-    /// h_c, metres.
-    pub critical_depth: f64,
-    /// Depth of the sea, metres, or pressure at the ground, Pa.
-    pub ground: ComponentPlan,
-    /// Height of the surface; without it 0.
-    pub surface: Option<ComponentPlan>,
     /// True if the component is the change of a particle's pressure, Pa/s, which is read as a vertical velocity.
     pub is_tendency: bool,
     /// Heights of the grid, ascending, metres.
@@ -86,52 +104,112 @@ pub struct Columns {
 }
 
 impl Columns {
+    pub fn is_of_air(&self) -> bool {
+        match &self.places {
+            Places::Formula { formula, .. } => formula.is_of_air(),
+            Places::Field { is_of_air, .. } => *is_of_air,
+        }
+    }
+
+    /// The variable that tells where the levels lie: their heights, or the depth or pressure at the ground.
+    pub fn teller(&self) -> &str {
+        match &self.places {
+            Places::Formula { ground, .. } => &ground.name,
+            Places::Field { heights, .. } => &heights.name,
+        }
+    }
+
     /// Reads a component like [`read_component`], but `orders[2]` are indices of [`Self::heights`]. Below the bottom it is missing. Between the bottom and
     /// the lowest level, and between the highest level and the surface, it is that of the level. The surface is taken to be at height 0 at least,
-    /// so that height 0 always is in the water.
+    /// so that height 0 always is in the water. A field of heights tells no bottom: below the lowest level it is missing.
     ///
     /// # Errors
     /// The values cannot be read.
     pub fn read(&self, file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
         let [x, y, wanted] = orders;
         let values = read_component(file, component, &[x.clone(), y.clone(), self.order.clone()], entry)?;
-        let ground = at_points(file, &self.ground, component, orders, entry)?;
-        let surface = self.surface.as_ref().map(|plan| at_points(file, plan, component, orders, entry)).transpose()?;
+        let (heights, ends) = self.columns_at(file, component, orders, entry)?;
         let plane = x.len() * y.len();
         let mut out = vec![f32::NAN; plane * wanted.len()];
-        let mut own = vec![0f32; self.levels.len()];
+        let mut known = Vec::with_capacity(self.order.len());
         for point in 0..plane {
-            let (ground, surface) = (ground[point], surface.as_ref().map_or(0.0, |surface| surface[point]));
-            for (height, &level) in own.iter_mut().zip(&self.levels) {
-                *height = self.formula.height(level, self.critical_depth, ground, surface) as f32;
-            }
-            let ends = self.formula.ends(ground, surface).map(|end| end as f32);
-            let value = |k: usize| {
-                let value = values[k * plane + point];
-                if self.is_tendency { upward(value.into(), pressure_at(own[k].into())) as f32 } else { value }
-            };
-            // A missing surface makes missing heights.
-            if own.iter().any(|height| !height.is_finite()) {
+            let height = |k: usize| heights[k * plane + point];
+            known.clear();
+            known.extend((0..self.order.len()).filter(|&k| height(k).is_finite()));
+            // What was never computed may be filled with one number.
+            let is_filled = matches!(self.places, Places::Field { .. }) && known.windows(2).any(|pair| height(pair[0]) >= height(pair[1]));
+            if known.is_empty() || is_filled {
                 continue;
             }
+            let value = |k: usize| {
+                let value = values[known[k] * plane + point];
+                if self.is_tendency { upward(value.into(), pressure_at(height(known[k]).into())) as f32 } else { value }
+            };
             for (level, &k) in wanted.iter().enumerate() {
-                let found = in_layer(self.heights[k] as f32, ends, own.len(), |k| own[k], value);
+                let found = in_layer(self.heights[k] as f32, ends[point], known.len(), |k| height(known[k]), value);
                 out[level * plane + point] = found.unwrap_or(f32::NAN);
             }
         }
         Ok(out)
     }
 
+    /// Heights of all levels over the points of a component, and the lower and upper end of each column, metres.
+    fn columns_at(
+        &self,
+        file: &DataFile,
+        component: &ComponentPlan,
+        orders: &Orders,
+        entry: usize,
+    ) -> Result<(Vec<f32>, Vec<[f32; 2]>), SourceError> {
+        match &self.places {
+            Places::Formula { formula, levels, critical_depth, ground, surface } => {
+                let ground = at_points(file, ground, 0, component, orders, entry)?;
+                let surface = surface.as_ref().map(|plan| at_points(file, plan, 0, component, orders, entry)).transpose()?;
+                let surface = surface.unwrap_or_else(|| vec![0.0; ground.len()]);
+                let columns = || ground.iter().zip(&surface);
+                let height = |level: &[f64; 2], (&ground, &surface)| formula.height(*level, *critical_depth, ground, surface) as f32;
+                let heights = levels.iter().flat_map(|level| columns().map(move |column| height(level, column))).collect();
+                Ok((heights, columns().map(|(&ground, &surface)| formula.ends(ground, surface).map(|end| end as f32)).collect()))
+            }
+            Places::Field { heights, is_of_air } => {
+                let plane = orders[0].len() * orders[1].len();
+                let mut found = Vec::with_capacity(plane * self.order.len());
+                for &level in &self.order {
+                    found.extend(at_points(file, heights, level, component, orders, entry)?.into_iter().map(|height| height as f32));
+                }
+                let ends = |point: usize| {
+                    let known = found[point..].iter().step_by(plane).filter(|height| height.is_finite());
+                    let lowest = known.fold(f32::INFINITY, |a, b| a.min(*b));
+                    [lowest, if *is_of_air { f32::NEG_INFINITY } else { 0.0 }]
+                };
+                let ends = (0..plane).map(ends).collect();
+                Ok((found, ends))
+            }
+        }
+    }
+
     /// Mean heights of the levels over all columns at the first time; in the sea with the surface at rest, and 0.
     pub fn mean_heights(&self, file: &DataFile) -> Result<Vec<f64>, SourceError> {
-        let mut grounds = read_component(file, &self.ground, &self.ground.file_order(), 0)?;
-        grounds.retain(|ground| ground.is_finite() && *ground > 0.0);
-        let mean = |level: &[f64; 2]| {
-            let heights = grounds.iter().map(|&ground| self.formula.height(*level, self.critical_depth, ground.into(), 0.0));
-            heights.sum::<f64>() / grounds.len() as f64
+        let mean = |heights: &mut dyn Iterator<Item = f64>| {
+            let (sum, count) = heights.filter(|z| z.is_finite()).fold((0.0, 0u32), |(sum, count), z| (sum + z, count + 1));
+            sum / f64::from(count)
         };
-        let mut heights: Vec<f64> = self.levels.iter().map(mean).filter(|z| z.is_finite()).collect();
-        if !self.formula.is_of_air() {
+        let mut heights: Vec<f64> = match &self.places {
+            Places::Formula { formula, levels, critical_depth, ground, .. } => {
+                let mut grounds = read_component(file, ground, &ground.file_order(), 0)?;
+                grounds.retain(|ground| ground.is_finite() && *ground > 0.0);
+                let of_level =
+                    |level: &[f64; 2]| mean(&mut grounds.iter().map(|&g| formula.height(*level, *critical_depth, g.into(), 0.0)));
+                levels.iter().map(of_level).collect()
+            }
+            Places::Field { heights, .. } => {
+                let [x, y, _] = heights.file_order();
+                let found = read_component(file, heights, &[x, y, self.order.clone()], 0)?;
+                found.chunks(found.len() / self.order.len()).map(|level| mean(&mut level.iter().map(|&z| z.into()))).collect()
+            }
+        };
+        heights.retain(|z| z.is_finite());
+        if !self.is_of_air() {
             heights.retain(|z| *z < 0.0);
             heights.push(0.0);
         }
@@ -141,24 +219,36 @@ impl Columns {
 
     /// Heights of the lowest ground and of the surface at rest or, in the atmosphere, of the highest level, metres.
     pub fn reach(&self, file: &DataFile) -> Result<[f64; 2], SourceError> {
-        let grounds = read_component(file, &self.ground, &self.ground.file_order(), 0)?;
-        // Deep, or of high pressure.
-        let lowest = grounds.into_iter().filter(|ground| ground.is_finite()).fold(f64::NEG_INFINITY, |a, b| a.max(b.into()));
-        let [bottom, surface] = self.formula.ends(lowest, 0.0);
-        let highest = self.levels.last().map_or(0.0, |&level| self.formula.height(level, self.critical_depth, lowest, 0.0));
-        Ok([bottom, if self.formula.is_of_air() { highest } else { surface }])
+        match &self.places {
+            Places::Formula { formula, levels, critical_depth, ground, .. } => {
+                let grounds = read_component(file, ground, &ground.file_order(), 0)?;
+                // Deep, or of high pressure.
+                let lowest = grounds.into_iter().filter(|ground| ground.is_finite()).fold(f64::NEG_INFINITY, |a, b| a.max(b.into()));
+                let [bottom, surface] = formula.ends(lowest, 0.0);
+                let highest = levels.last().map_or(0.0, |&level| formula.height(level, *critical_depth, lowest, 0.0));
+                Ok([bottom, if formula.is_of_air() { highest } else { surface }])
+            }
+            Places::Field { heights, is_of_air } => {
+                let found = read_component(file, heights, &heights.file_order(), 0)?;
+                let known = found.into_iter().filter(|z| z.is_finite()).map(f64::from);
+                let [low, high] = known.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
+                Ok([low, if *is_of_air { high } else { high.max(0.0) }])
+            }
+        }
     }
 }
 
-/// A field of the plane at the points of a component: means of those beside them that are known, if the field has one point more along an axis.
+/// A level of a field at the points of a component: means of those beside them that are known, if the field has one point more along an axis.
 fn at_points(
     file: &DataFile,
     plan: &ComponentPlan,
+    level: usize,
     component: &ComponentPlan,
     [x, y, _]: &Orders,
     entry: usize,
 ) -> Result<Vec<f64>, SourceError> {
-    let values = read_component(file, plan, &plan.file_order(), entry)?;
+    let [all_x, all_y, _] = plan.file_order();
+    let values = read_component(file, plan, &[all_x, all_y, vec![level]], entry)?;
     let width = plan.along(0);
     let reach = [0, 1].map(|k| usize::from(plan.along(k) > component.along(k)));
     let mut out = Vec::with_capacity(x.len() * y.len());

@@ -1,18 +1,19 @@
-//! Finds levels that follow the bottom of the sea or the ground: by `formula_terms` (CF conventions, appendix D), else by the names of ROMS and CROCO.
+//! Finds levels that follow the bottom of the sea or the ground: by `formula_terms` (CF conventions, appendix D), by the names of ROMS and CROCO, or by a field
+//! of their heights.
 
 use super::axes::{AxisPlan, Quantity};
-use super::column::{Columns, Formula};
+use super::column::{Columns, Formula, Places};
 use super::component::{ComponentPlan, Role, read_component};
 use super::dimensions::Extent;
 use super::layout::Layout;
 use super::levels::REFERENCE_PRESSURE;
 use super::planner::Planner;
-use crate::archive_settings::{Metric, VelocityUnit};
+use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::units::Unit;
 use crate::cf::velocity::{Candidate, Velocity};
 use crate::error::SourceError;
-use crate::formats::{Attribute, Variable};
+use crate::formats::{Attribute, Listing, Variable};
 use ridgewatch_field::Axis;
 use std::sync::Arc;
 
@@ -21,7 +22,7 @@ pub struct Terrain {
     of: Vec<Option<(usize, Arc<Columns>)>>,
     /// Heights of the grid, metres; one if a single one is read.
     heights: Vec<f64>,
-    formula: Formula,
+    is_of_air: bool,
 }
 
 /// Mean pressures at the ground that are taken as such, Pa.
@@ -37,7 +38,7 @@ impl Terrain {
 
     /// True if w may be the change of a particle's pressure.
     pub fn is_of_air(&self) -> bool {
-        self.formula.is_of_air()
+        self.is_of_air
     }
 
     /// False if a single height is read.
@@ -60,7 +61,16 @@ impl Planner<'_> {
     pub fn terrain(&mut self, velocity: &Velocity, extents: &mut [Extent], first: Option<&Layout>) -> Result<Option<Terrain>, SourceError> {
         let time = extents.iter().find(|e| e.kind == Kind::Time).map(|e| e.dimension);
         let u = velocity.u.variable;
-        let Some((dimension, columns)) = self.columns(u, time)? else { return Ok(None) };
+        let found = self.columns(u, time)?;
+        // A level that is selected is read as it is.
+        let is_selected = self.variable(u).dimensions.iter().any(|&d| self.settings.entry(&self.listing().dimensions[d].name).is_some());
+        if let Some(field) = self.named_heights()
+            && !is_selected
+            && found.as_ref().is_none_or(|(_, columns)| *columns.teller() != self.variable(field).name)
+        {
+            return Err(self.misfit(field, self.of_other_levels(u)));
+        }
+        let Some((dimension, columns)) = found else { return Ok(None) };
         let Some(extent) = extents.iter_mut().find(|e| e.dimension == dimension) else { return Ok(None) };
         extent.kind = Kind::Level;
         let mut found = vec![Some((dimension, columns))];
@@ -77,7 +87,8 @@ impl Planner<'_> {
             None => None,
         });
         let Some((_, columns)) = &found[0] else { return Ok(None) };
-        if columns.formula.is_of_air() {
+        let is_of_air = columns.is_of_air();
+        if is_of_air && matches!(columns.places, Places::Formula { .. }) {
             self.check_is_height(dimension)?;
         }
         let heights = self.heights_for(columns, first)?;
@@ -86,31 +97,32 @@ impl Planner<'_> {
             [one] => format!("to height {one} m"),
             _ => format!("to {} heights from {:.1} to {:.1} m", heights.len(), heights[0], heights[heights.len() - 1]),
         };
-        let formula = columns.formula;
-        let default = match formula.is_of_air() {
+        let default = match is_of_air {
             true => "the mean heights of the levels over all columns; others with archive.heights, one with --set archive.level=HEIGHT",
             false => {
                 "0 and the mean heights of the levels over all columns; others with archive.heights, one with --set archive.level=-DEPTH"
             }
         };
         let why = if (self.settings.level, &self.settings.heights) == (None, &None) { default } else { "as set" };
-        let surface =
-            columns.surface.as_ref().map_or("at rest, since no term gives its height".into(), |s| format!("`{}` of each time", s.name));
-        let ground = &columns.ground.name;
-        let (follows, terms, under) = match formula.is_of_air() {
-            true => (
-                "the ground",
-                format!("pressure at the ground `{ground}`, heights z = -H ln(p / p0) with H = 7 km and p0 = 1000 hPa"),
-                "the ground",
+        let under = if is_of_air { "the ground" } else { "the bottom" };
+        let teller = columns.teller();
+        let lie = match &columns.places {
+            Places::Formula { .. } if is_of_air => format!(
+                "follows the ground (CF conventions, appendix D; pressure at the ground `{teller}`, heights z = -H ln(p / p0) with H = 7 km and p0 = 1000 hPa)"
             ),
-            false => ("the bottom", format!("depth `{ground}`, surface {surface}"), "the bottom"),
+            Places::Formula { surface, .. } => {
+                let surface =
+                    surface.as_ref().map_or("at rest, since no term gives its height".into(), |s| format!("`{}` of each time", s.name));
+                format!("follows the bottom (CF conventions, appendix D; depth `{teller}`, surface {surface})")
+            }
+            Places::Field { heights, .. } => {
+                let positive = if heights.factor < 0.0 { "down" } else { "up" };
+                format!("lies at the heights `{teller}` of each point (positive {positive})")
+            }
         };
-        self.note(format!(
-            "`{level}` follows {follows} (CF conventions, appendix D; {terms}): each column is interpolated between its own levels {to} ({why}); below \
-             {under} it is missing"
-        ));
+        self.note(format!("`{level}` {lie}: each column is interpolated between its own levels {to} ({why}); below {under} it is missing"));
         let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
-        Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, formula }))
+        Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, is_of_air }))
     }
 
     /// True if w is the change of a particle's pressure: by its unit or, without one, by its names.
@@ -145,7 +157,7 @@ impl Planner<'_> {
             (Some(level), None, None) => {
                 let [low, high] = columns.reach(self.file)?;
                 if !(low..=high).contains(&level) {
-                    let accepted = match columns.formula.is_of_air() {
+                    let accepted = match columns.is_of_air() {
                         true => format!("heights in metres: from {low:.1} at the lowest ground to {high:.1}"),
                         false => format!("heights in metres, negative below the surface: from {low:.1} at the deepest bottom to 0"),
                     };
@@ -154,7 +166,7 @@ impl Planner<'_> {
                 Ok(vec![level])
             }
             (None, Some(heights), None) if heights.len() < 2 => {
-                let accepted = match columns.formula.is_of_air() {
+                let accepted = match columns.is_of_air() {
                     true => "two heights or more, in metres; one with --set archive.level=HEIGHT",
                     false => "two heights or more, in metres, negative below the surface; one with --set archive.level=-DEPTH",
                 };
@@ -162,9 +174,11 @@ impl Planner<'_> {
             }
             (None, Some(heights), None) => Ok(heights.clone()),
             (None, None, None) => match columns.mean_heights(self.file)? {
-                heights if heights.len() < 2 => {
-                    Err(SourceError::variable(self.path(), &columns.ground.name, "it is nowhere above 0: the levels have no heights"))
-                }
+                heights if heights.len() < 2 => Err(SourceError::variable(
+                    self.path(),
+                    columns.teller(),
+                    "it gives the levels no heights: its values are missing, or none is above 0",
+                )),
                 heights => Ok(heights),
             },
         }
@@ -218,6 +232,10 @@ impl Planner<'_> {
         {
             let coordinates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
             let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
+            let field = self.field_of_heights(variable, dimension);
+            if let (Some(field), true) = (field, field == self.named_heights() || declared.is_none()) {
+                return Ok(Some((dimension, self.by_field(field, [x, y], time, variable)?)));
+            }
             let found = match declared {
                 Some(level) => self.by_terms(variable, dimension, level)?,
                 None => self.by_names(dimension)?,
@@ -229,14 +247,14 @@ impl Planner<'_> {
                 return Err(self.misfit(variable, "a term of its levels is missing or not a number"));
             }
             let plane = [x, y].map(|d| self.listing().dimensions[d].len);
-            let ground = self.plane_field(ground, plane, time, variable)?;
-            let surface = surface.map(|index| self.plane_field(index, plane, time, variable)).transpose()?;
+            let ground = self.field_of_columns(ground, None, plane, time, variable)?;
+            let surface = surface.map(|index| self.field_of_columns(index, None, plane, time, variable)).transpose()?;
             let levels = order.iter().map(|&k| levels[k]).collect();
             if formula.is_of_air() {
                 self.check_pressures(&ground)?;
             }
-            let columns = Columns { formula, levels, order, critical_depth, ground, surface, is_tendency: false, heights: Vec::new() };
-            return Ok(Some((dimension, columns)));
+            let places = Places::Formula { formula, levels, critical_depth, ground: Box::new(ground), surface: surface.map(Box::new) };
+            return Ok(Some((dimension, Columns { places, order, is_tendency: false, heights: Vec::new() })));
         }
         Ok(None)
     }
@@ -255,6 +273,77 @@ impl Planner<'_> {
             PRESSURES[1] / 100.0
         );
         Err(SourceError::variable(self.path(), &ground.name, what))
+    }
+
+    /// See [`named_heights`].
+    pub fn named_heights(&self) -> Option<usize> {
+        named_heights(self.listing(), self.settings)
+    }
+
+    /// Why a field of heights does not fit a variable.
+    fn of_other_levels(&self, of: usize) -> String {
+        let [name, dimensions] = [&self.variable(of).name, &self.listing().dimension_names(self.variable(of))].map(Clone::clone);
+        format!(
+            "`z` must name a coordinate of one dimension, or heights whose dimensions are levels, y and x as those of `{name}` ({dimensions})"
+        )
+    }
+
+    /// A field that tells the height of each point along the levels of a variable: the one that `archive.z` names, else, if the levels have no coordinates in
+    /// metres or pressures, the one among the variable's `coordinates`.
+    fn field_of_heights(&self, variable: usize, dimension: usize) -> Option<usize> {
+        let levels = |i: usize| self.variable(i).dimensions.iter().rev().nth(2).copied();
+        let along = |&i: &usize| levels(i) == Some(dimension) && self.variable(i).number.is_number();
+        // A mesh may have other names for its dimensions.
+        let as_many = |&i: &usize| {
+            let len = |d: usize| self.listing().dimensions[d].len;
+            along(&i) || levels(i).is_some_and(|d| len(d) == len(dimension) && !self.variable(variable).dimensions.contains(&d))
+        };
+        let unit = |i: usize| self.axis_units(Kind::Level, i).and_then(Unit::parse);
+        if let Some(named) = self.named_heights().filter(as_many) {
+            return Some(named);
+        }
+        if self.measured(dimension).coordinate.and_then(unit).is_some_and(|unit| unit.is_length() || unit.is_pressure()) {
+            return None;
+        }
+        let names = self.variable(variable).text("coordinates")?;
+        let is_length = |&i: &usize| unit(i).is_some_and(|unit| unit.is_length());
+        names.split_whitespace().filter_map(|name| self.listing().find(name)).filter(along).find(is_length)
+    }
+
+    /// Levels whose heights a field tells.
+    fn by_field(&self, field: usize, [x, y]: [usize; 2], time: Option<usize>, of: usize) -> Result<Columns, SourceError> {
+        let plane = [x, y].map(|d| self.listing().dimensions[d].len);
+        let levels = self.variable(field).dimensions.iter().rev().nth(2).copied();
+        let mut heights = self.field_of_columns(field, levels, plane, time, of)?;
+        let found = read_component(self.file, &heights, &heights.file_order(), 0)?;
+        // Of a level, over all points.
+        let mean = |level: &[f32]| {
+            let known = level.iter().filter(|z| z.is_finite());
+            let (sum, count) = known.fold((0.0, 0u32), |(sum, count), &z| (sum + f64::from(z), count + 1));
+            sum / f64::from(count)
+        };
+        let means: Vec<f64> = found.chunks(found.len() / heights.along(2)).map(mean).collect();
+        let mut order: Vec<usize> = (0..means.len()).filter(|&k| means[k].is_finite()).collect();
+        if order.len() < 2 {
+            return Err(self.misfit(field, "fewer than two of its levels have heights"));
+        }
+        let variable = self.variable(field);
+        let says_depth = |text: &str| ["depth", "dep"].iter().any(|word| text.to_ascii_lowercase().contains(word));
+        let is_down = match variable.text("positive").map(str::to_ascii_lowercase).as_deref() {
+            Some("down") => true,
+            Some("up") => false,
+            _ => {
+                (says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth))
+                    && order.iter().any(|&k| means[k] > 0.0)
+            }
+        };
+        if is_down {
+            heights.factor = -heights.factor;
+        }
+        let rank = |k: usize| if is_down { -means[k] } else { means[k] };
+        order.sort_by(|&a, &b| rank(a).total_cmp(&rank(b)));
+        let is_of_air = order.iter().map(|&k| rank(k)).sum::<f64>() > 0.0;
+        Ok(Columns { places: Places::Field { heights: Box::new(heights), is_of_air }, order, is_tendency: false, heights: Vec::new() })
     }
 
     /// Terms that `formula_terms` of the coordinate `level` names.
@@ -415,8 +504,16 @@ impl Planner<'_> {
         Ok(names.iter().find_map(attribute))
     }
 
-    /// A length or a pressure over the plane of a variable, on its points or with one more along x or y; its last two dimensions are y and x.
-    fn plane_field(&self, field: usize, plane: [usize; 2], time: Option<usize>, of: usize) -> Result<ComponentPlan, SourceError> {
+    /// A length or a pressure over the plane of a variable, on its points or with one more along x or y, and along its levels, if they are given; its last
+    /// two dimensions are y and x.
+    fn field_of_columns(
+        &self,
+        field: usize,
+        levels: Option<usize>,
+        plane: [usize; 2],
+        time: Option<usize>,
+        of: usize,
+    ) -> Result<ComponentPlan, SourceError> {
         let variable = self.variable(field);
         let shape = self.shape(field);
         let rank = shape.len();
@@ -430,7 +527,7 @@ impl Planner<'_> {
             );
             return Err(self.misfit(field, what));
         }
-        if let Some(k) = (0..rank - 2).find(|&k| shape[k] > 1 && Some(variable.dimensions[k]) != time) {
+        if let Some(k) = (0..rank - 2).find(|&k| shape[k] > 1 && ![time, levels].contains(&Some(variable.dimensions[k]))) {
             let (name, of) = (&self.listing().dimensions[variable.dimensions[k]].name, &self.variable(of).name);
             return Err(
                 self.misfit(field, format!("its dimension `{name}` is not that of the times of `{of}`: which entry counts is not known"))
@@ -439,6 +536,7 @@ impl Planner<'_> {
         self.listing().check_count(variable, &shape[rank - 2..])?;
         let role = |k: usize| match rank - 1 - k {
             axis @ 0..=1 => Role::Axis(axis),
+            _ if Some(variable.dimensions[k]) == levels => Role::Axis(2),
             _ if Some(variable.dimensions[k]) == time => Role::Time,
             _ => Role::Fixed(0),
         };
@@ -457,6 +555,11 @@ impl Planner<'_> {
             own: Default::default(),
         })
     }
+}
+
+/// The field of heights that `archive.z` names.
+pub fn named_heights(listing: &Listing, settings: &ArchiveSettings) -> Option<usize> {
+    listing.find(settings.z.as_ref()?).filter(|&field| listing.variables[field].dimensions.len() >= 3)
 }
 
 /// What a formula needs.

@@ -1,5 +1,6 @@
 //! What one file of an archive holds, for files that have to be read together.
 
+use super::column_plan::named_heights;
 use super::mask::holds_mask;
 use super::planner::Planner;
 use super::unstructured_plan::holds_mesh;
@@ -19,7 +20,7 @@ pub struct Content {
     pub when: String,
     /// Names and shapes of the variables that do not change with time.
     pub fixed: Vec<(String, Vec<usize>)>,
-    /// True if it holds a mask, longitudes and latitudes of two dimensions, or an unstructured mesh.
+    /// True if it holds a mask, longitudes and latitudes of two dimensions, an unstructured mesh, or the heights of levels that are named.
     pub helps: bool,
 }
 
@@ -53,10 +54,17 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Result<Option<Con
         seconds: Vec::new(),
         when: String::new(),
         fixed: fixed(listing),
-        helps: holds_mask(listing, settings) || pair.iter().all(Option::is_some) || holds_mesh(listing),
+        helps: holds_mask(listing, settings)
+            || pair.iter().all(Option::is_some)
+            || holds_mesh(listing)
+            || named_heights(listing, settings).is_some(),
     };
     if let Some(variable) = variables.into_iter().flatten().next() {
-        let mut planner = Planner::new(file, settings);
+        // Coordinates may lie in another file.
+        let mut own = settings.clone();
+        let is_here = |name: &String| listing.find(name).is_some() || listing.dimensions.iter().any(|d| d.name == *name);
+        [&mut own.x, &mut own.y, &mut own.z].into_iter().for_each(|name| *name = name.take().filter(is_here));
+        let mut planner = Planner::new(file, &own);
         let time = match planner.extents(variable).and_then(|extents| planner.time(&extents)) {
             Ok(time) => time,
             // What is wrong with whole files is told when they are planned.

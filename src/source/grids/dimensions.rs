@@ -50,7 +50,7 @@ impl Planner<'_> {
             // A scalar time variable is found later.
             let variable = name.as_ref().and_then(|n| self.listing().find(n));
             let scalar = key == "time" && variable.is_some_and(|v| self.variable(v).dimensions.is_empty());
-            let aside = scalar || (is_pair && matches!(key, "x" | "y"));
+            let aside = scalar || (is_pair && matches!(key, "x" | "y")) || (key == "z" && self.named_heights().is_some());
             if let Some((dimension, coordinate)) = if aside { None } else { self.named_axis(key, name)? } {
                 // The setting says which axis it is, the file whether it is an angle.
                 let kind = match (kind, coordinate.map(|c| classify(self.variable(c)))) {

@@ -21,6 +21,9 @@ pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>)
     let components = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()];
     components.into_iter().flatten().try_for_each(|c| planner.check_extents(c.variable))?;
     if planner.is_staggered(&velocity) {
+        if let Some(field) = planner.named_heights() {
+            return Err(planner.misfit(field, "the heights of WRF's levels are those of `PH` and `PHB`: leave out `z`"));
+        }
         planner.plan_staggered(&velocity, first)
     } else if let Some(points) = planner.unstructured_points(&velocity)? {
         planner.plan_curvilinear(&velocity, points, first)

@@ -1,0 +1,219 @@
+//! Levels whose heights are a field: partial cells at the bottom, layers that move, a model of the atmosphere. Velocities are proportional to the height.
+
+use crate::kit::netcdf::*;
+use crate::{HOURS, inspected, notes, open, open_with, refused};
+use ridgewatch::source::{Archive, SnapshotSource};
+use tempfile::tempdir;
+
+const NX: usize = 9;
+const NY: usize = 6;
+const LEVELS: usize = 8;
+
+/// A field of heights in a file, and what it is told by.
+#[derive(Clone, Copy)]
+struct Layers {
+    /// Height of the centre of a layer, counted from the top, at a time and a longitude, metres.
+    height: fn(time: usize, layer: usize, lon: f64) -> f64,
+    /// Name, unit, how many metres it is, attribute `positive`.
+    name: &'static str,
+    unit: (&'static str, f64),
+    positive: Option<&'static str>,
+    /// True if `coordinates` of u and v name it.
+    named: bool,
+    moves: bool,
+    w: bool,
+}
+
+/// Layers of a sloping sea, moved by the tide.
+fn sloping(time: usize, layer: usize, lon: f64) -> f64 {
+    -(layer as f64 + 0.5) * (8.0 + 4.0 * (lon - 10.0) + 0.5 * time as f64)
+}
+
+/// Levels 10 m apart. The last layer is thinner to the east: its centre is higher.
+fn partial(_: usize, layer: usize, lon: f64) -> f64 {
+    let thinner = if layer == LEVELS - 1 { 4.0 * (lon - 10.0) } else { 0.0 };
+    -(10.0 * layer as f64 + 5.0) + thinner
+}
+
+/// Layers above a mountain.
+fn of_air(_: usize, layer: usize, lon: f64) -> f64 {
+    let ground = 800.0 * (lon - 10.0);
+    ground + ((LEVELS - layer) as f64 - 0.5) * (12_000.0 - ground) / LEVELS as f64
+}
+
+impl Default for Layers {
+    fn default() -> Self {
+        Self { height: sloping, name: "depths", unit: ("km", 1000.0), positive: Some("down"), named: true, moves: true, w: true }
+    }
+}
+
+impl Layers {
+    fn fixture(&self) -> Fixture {
+        let &Self { height, name, unit: (unit, metres), positive, named, moves, w } = self;
+        let (lon, lat): (Vec<f64>, Vec<f64>) = ((0..NX).map(|i| 10.0 + 0.1 * i as f64).collect(), (0..NY).map(|j| j as f64).collect());
+        let axes: [(&str, &str, &[f64]); 3] = [("time", HOURS, &[0.0, 1.0]), ("lat", "degrees_north", &lat), ("lon", "degrees_east", &lon)];
+        let mut fixture = Fixture::on(NETCDF4, &axes).dimension("layer", LEVELS).dimension("face", LEVELS + 1);
+        // Faces lie half way between the centres, and as far beyond them.
+        let face = move |time: usize, face: usize, lon: f64| {
+            let at = |layer: usize| height(time, layer, lon);
+            match face {
+                0 => 1.5 * at(0) - 0.5 * at(1),
+                LEVELS => 1.5 * at(LEVELS - 1) - 0.5 * at(LEVELS - 2),
+                _ => 0.5 * (at(face - 1) + at(face)),
+            }
+        };
+        let sign = if positive == Some("up") { 1.0 } else { -1.0 };
+        for (component, factor, level) in [("u", 0.01, "layer"), ("v", -0.01, "layer"), ("w", 1e-3, "face")] {
+            let count = if level == "layer" { LEVELS } else { LEVELS + 1 };
+            let z = |n: usize, x: usize| {
+                if level == "layer" { height(n / count, n % count, lon[x]) } else { face(n / count, n % count, lon[x]) }
+            };
+            let field = if level == "layer" { name.to_string() } else { format!("{name}_w") };
+            if component != "v" && (w || component == "u") {
+                let times = if moves { 2 } else { 1 };
+                let data = Data::F64(fill(times * count, NY, NX, |n, _, x| sign * z(n, x) / metres));
+                let dimensions = if moves { vec!["time", level, "lat", "lon"] } else { vec![level, "lat", "lon"] };
+                fixture = fixture.variable(&field, &dimensions, data).with("units", unit);
+                if let Some(positive) = positive {
+                    fixture = fixture.with("positive", positive);
+                }
+            }
+            if component == "w" && !w {
+                continue;
+            }
+            let data = f32s(fill(2 * count, NY, NX, |n, _, x| factor * z(n, x)));
+            fixture = fixture.variable(component, &["time", level, "lat", "lon"], data).with("units", "m s-1");
+            fixture = fixture.with(
+                "standard_name",
+                match component {
+                    "u" => "eastward_sea_water_velocity",
+                    "v" => "northward_sea_water_velocity",
+                    _ => "upward_sea_water_velocity",
+                },
+            );
+            if named {
+                fixture = fixture.with("coordinates", format!("{field} lat lon").as_str());
+            }
+        }
+        fixture
+    }
+
+    /// Checks every node against its own height. Returns how many were known.
+    fn check(&self, archive: &mut Archive) -> usize {
+        let mut known = 0;
+        for time in 0..2 {
+            let snapshot = archive.read(time).unwrap();
+            let [nx, ny, nz] = snapshot.grid.shape();
+            for i in 0..nx * ny * nz {
+                let (lon, z) = (snapshot.grid.axes[0].coordinates()[i % nx], snapshot.grid.axes[2].coordinates()[i / (nx * ny)]);
+                let [high, low] = [0, LEVELS - 1].map(|layer| (self.height)(time, layer, lon));
+                // Between the highest level of the sea and its surface the velocity is that of the level.
+                let top = if high < 0.0 { 0.0 } else { high };
+                let node = snapshot.nodes[i];
+                if (z - low).abs() < 1e-3 || (z - top).abs() < 1e-3 {
+                    continue;
+                }
+                assert_eq!(node[3].is_nan(), !(low..=top).contains(&z), "{lon} E, {z} m, time {time}: {node:?}");
+                if node[3].is_nan() {
+                    continue;
+                }
+                let [east, north] = east_north(&snapshot, i);
+                let from = z.min(high);
+                let off = (east - from / 100.0).abs().max((north + from / 100.0).abs());
+                assert!(off < 2e-6 * (1.0 + from.abs() / 100.0), "{lon} E, {z} m, time {time}: {east} {north}");
+                // w has faces above the highest centre.
+                if z <= high {
+                    let up = if self.w { z / 1000.0 } else { 0.0 };
+                    assert!((f64::from(node[3]) - up).abs() < 1e-6 * (1.0 + up.abs()), "{lon} E, {z} m, time {time}: {}", node[3]);
+                }
+                known += 1;
+            }
+        }
+        known
+    }
+}
+
+#[test]
+fn layers_lie_where_their_field_says() {
+    let dir = tempdir().unwrap();
+    let file = |name: &str, layers: &Layers| layers.fixture().write(&dir.path().join(name));
+    let moving = Layers::default();
+    let moved = file("moving.nc", &moving);
+    let mut archive = open_with(&[&moved], "heights = [-60.0, -40.0, -20.0, -10.0, -2.0, 0.0]");
+    assert!(moving.check(&mut archive) > 400);
+    let said = notes(&archive);
+    assert!(said.contains("`layer` lies at the heights `depths` of each point (positive down)"), "{said}");
+    // The mean heights, and 0.
+    let mut archive = open(&[&moved]);
+    assert_eq!(archive.grid().axes[2].len(), LEVELS + 1);
+    assert!((archive.grid().axes[2].coordinates()[0] - sloping(0, LEVELS - 1, 10.4)).abs() < 1e-3);
+    assert!(moving.check(&mut archive) > 500);
+    assert!(inspected(&[&moved]).to_string().contains("z `altitude`: 9 nodes"));
+
+    // Without `positive`, by the name. Of one time.
+    let still = Layers { height: |_, layer, lon| sloping(0, layer, lon), positive: None, moves: false, unit: ("m", 1.0), ..moving };
+    assert!(still.check(&mut open_with(&[file("still.nc", &still)], "heights = [-60.0, -30.0, -10.0]")) > 150);
+
+    let air = Layers { height: of_air, name: "altitude", positive: Some("up"), unit: ("m", 1.0), moves: false, ..moving };
+    let air_file = file("air.nc", &air);
+    let mut archive = open_with(&[&air_file], "heights = [800.0, 1200.0, 2000.0, 6000.0, 11000.0]");
+    assert!(air.check(&mut archive) > 300);
+    assert!(notes(&archive).contains("below the ground it is missing"));
+    let mut one = open_with(&[&air_file], "level = 2000.0");
+    let snapshot = one.read(0).unwrap();
+    assert!((east_north(&snapshot, 0)[0] - 20.0).abs() < 1e-4);
+}
+
+/// Levels with depths of their own, and a field that says more: it has to be named, and may lie in another file.
+#[test]
+fn partial_cells_by_a_field_that_is_named() {
+    let dir = tempdir().unwrap();
+    let layers = Layers { height: partial, name: "gdept_0", unit: ("m", 1.0), positive: None, named: false, moves: false, w: false };
+    let depths: Vec<f64> = (0..LEVELS).map(|k| 10.0 * k as f64 + 5.0).collect();
+    let with_depths =
+        |fixture: Fixture| fixture.variable("layer", &["layer"], Data::F64(depths.clone())).with("units", "m").with("positive", "down");
+    let whole = with_depths(layers.fixture());
+    let file = whole.write(&dir.path().join("whole.nc"));
+    let heights = "heights = [-73.0, -70.0, -66.0, -40.0, -12.0]";
+    assert!(layers.check(&mut open_with(&[&file], &format!("z = \"gdept_0\"\n{heights}"))) > 300);
+    // Without the name levels are flat.
+    assert!(!notes(&open(&[&file])).contains("gdept_0"));
+
+    let [mut currents, mut mesh] = [with_depths(layers.fixture()), layers.fixture()];
+    currents.variables.retain(|v| v.name != "gdept_0");
+    mesh.variables.retain(|v| !["u", "v", "time"].contains(&v.name.as_str()));
+    let files = [currents.write(&dir.path().join("currents.nc")), mesh.write(&dir.path().join("mesh.nc"))];
+    assert!(layers.check(&mut open_with(&files, &format!("z = \"gdept_0\"\n{heights}"))) > 300);
+
+    // A mesh file whose dimensions have other names, as NEMO's.
+    let data = fill(LEVELS, NY, NX, |k, _, x| -partial(0, k, 10.0 + 0.1 * x as f64));
+    let mesh = Fixture::new(NETCDF4, &[("t", 1), ("z", LEVELS), ("y", NY), ("x", NX)]);
+    let mesh = mesh.variable("gdept_0", &["t", "z", "y", "x"], Data::F64(data)).with("units", "m").write(&dir.path().join("mesh_mask.nc"));
+    assert!(layers.check(&mut open_with(&[&files[0], &mesh], &format!("z = \"gdept_0\"\n{heights}"))) > 300);
+
+    // Land that was filled with zeros has no columns.
+    let mut filled = with_depths(layers.fixture());
+    for variable in filled.variables.iter_mut().filter(|v| v.name == "gdept_0") {
+        if let Data::F64(values) = &mut variable.data {
+            values.iter_mut().step_by(NX).for_each(|value| *value = 0.0);
+        }
+    }
+    let mut archive = open_with(&[filled.write(&dir.path().join("filled.nc"))], "z = \"gdept_0\"\nheights = [-60.0, -40.0]");
+    let snapshot = archive.read(0).unwrap();
+    let land = |i: usize| i.is_multiple_of(NX);
+    assert!((0..snapshot.nodes.len()).all(|i| snapshot.nodes[i][3].is_nan() == land(i)));
+
+    // A level that is selected is read as it is.
+    let mut level = open_with(&[&file], "z = \"gdept_0\"\nselect.layer = 2");
+    assert!((east_north(&level.read(0).unwrap(), 0)[0] + 0.25).abs() < 1e-6);
+
+    refused(&[&files[0]], "z = \"gdept_0\"", &["gdept_0"]);
+    let mut other = whole.dimension("deep", 3);
+    other = other.variable("dz", &["deep", "lat", "lon"], Data::F64(vec![1.0; 3 * NX * NY]));
+    refused(&[other.write(&dir.path().join("other.nc"))], "z = \"dz\"", &["other.nc", "`dz`", "levels, y and x as those of `u`"]);
+    let mut empty = with_depths(layers.fixture());
+    for variable in empty.variables.iter_mut().filter(|v| v.name == "gdept_0") {
+        variable.data = Data::F64(vec![f64::NAN; LEVELS * NX * NY]);
+    }
+    refused(&[empty.write(&dir.path().join("empty.nc"))], "z = \"gdept_0\"", &["`gdept_0`", "fewer than two of its levels have heights"]);
+}
