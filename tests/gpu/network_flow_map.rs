@@ -154,7 +154,7 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         for (frames, there) in [(&found, true), (&expected, false)] {
             for frame in frames {
                 let record = &frame.record;
-                assert!(record.warnings.is_empty(), "{name}: {:?}", record.warnings);
+                assert!(warnings(record).is_empty(), "{name}: {:?}", record.warnings);
                 assert_eq!(record.training.as_ref().unwrap().device_seconds.is_some(), there, "{name}");
                 // A GPU that walks answers points ahead of their flights; one that only traces does not.
                 assert_eq!(record.speculative_traces > 0, there, "{name}");

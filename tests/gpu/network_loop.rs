@@ -45,7 +45,7 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
             let learned = frame.record.training.clone().unwrap();
             assert_eq!((learned.steps, learned.rollbacks), (steps, 0));
             assert_eq!(learned.device_seconds.is_some(), device.is_gpu());
-            assert!(frame.record.warnings.is_empty(), "{:?}", frame.record.warnings);
+            assert!(warnings(&frame.record).is_empty(), "{:?}", frame.record.warnings);
         }
         let psnr = |frame: &Frame| frame.record.surrogate_psnr.unwrap();
         // The first frame is answered by what the run began with.
@@ -104,7 +104,7 @@ fn a_network_with_the_start_time_slides_on_the_device() {
                 before.replay_samples,
                 after.replay_samples
             );
-            assert!(after.warnings.is_empty(), "{:?}", after.warnings);
+            assert!(warnings(after).is_empty(), "{:?}", after.warnings);
             assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
         }
         assert!(psnr(frames)[frames.len() - 1] > psnr(frames)[0] + 5.0, "it learns");
@@ -175,7 +175,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
     let found = pictures(&device(GpuSettings::default()), 0, few);
     for frame in &found {
         let record = &frame.record;
-        assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
+        assert!(record.device.starts_with("cuda:0") && warnings(record).is_empty(), "{:?}", record.warnings);
         // A GPU that walks answers points ahead of their flights; one that only traces does not.
         assert!(record.speculative_traces > 0, "the device walks");
         assert!(record.traced_share > 0.05 && record.traced_share < 0.9, "traced: {}", record.traced_share);

@@ -9,7 +9,7 @@ use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
-use ridgewatch::run::{Frame, RunOptions, Setup};
+use ridgewatch::run::{Frame, FrameRecord, RunOptions, Setup};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostNetwork, Hybrid, Kind, Trace};
 use std::collections::hash_map::RandomState;
@@ -41,6 +41,11 @@ pub fn device_when_lost(settings: GpuSettings, when_lost: WhenLost) -> Device {
 pub fn resident(gpu: &Arc<Gpu>, kind: Kind, nodes: [usize; 3], network: &NetworkSettings, tracer: &CudaTracer) -> Hybrid<OnGpu> {
     let training = |model| CudaTraining::new(gpu, HostNetwork::fresh(model), true);
     Hybrid::<OnGpu>::new(kind, nodes, network, 5, tracer, training).unwrap().unwrap()
+}
+
+/// Warnings of a record, without that of few audit points, which small scenes have.
+pub fn warnings(record: &FrameRecord) -> Vec<&str> {
+    record.warnings.iter().map(String::as_str).filter(|warning| !warning.contains("audit points: where up to")).collect()
 }
 
 /// All frames of a scene with further `keys`.

@@ -72,7 +72,11 @@ fn tau_and_direction_are_steered_on_the_device() {
         assert_eq!(told(&found), told(&expected), "{method}");
         assert_eq!((found[2].record.tau, found[2].record.time), (2.5, 5.0), "{method}");
         for (frame, other) in found.iter().zip(&expected) {
-            assert!(frame.record.device.starts_with("cuda:0") && frame.record.warnings.is_empty(), "{method}: {:?}", frame.record.warnings);
+            assert!(
+                frame.record.device.starts_with("cuda:0") && warnings(&frame.record).is_empty(),
+                "{method}: {:?}",
+                frame.record.warnings
+            );
             let psnr = compare_films(&frame.film, &other.film, frame.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
             measured!("tau and direction steered, `{method}`, frame {}: {psnr:.1} dB", frame.record.frame);
             // Two samplings of one picture, or the same march.
