@@ -35,6 +35,12 @@ fn partial(_: usize, layer: usize, lon: f64) -> f64 {
     -(10.0 * layer as f64 + 5.0) + thinner
 }
 
+/// Layers that are thinner to the west, where two have no thickness.
+fn vanishing(_: usize, layer: usize, lon: f64) -> f64 {
+    let (thick, thin) = (layer.min(2) + layer.saturating_sub(4), layer.clamp(2, 4) - 2);
+    -(5.0 + 10.0 * thick as f64 + 50.0 * (lon - 10.0) * thin as f64)
+}
+
 /// Layers above a mountain.
 fn of_air(_: usize, layer: usize, lon: f64) -> f64 {
     let ground = 800.0 * (lon - 10.0);
@@ -150,6 +156,10 @@ fn layers_lie_where_their_field_says() {
     assert!(moving.check(&mut archive) > 500);
     assert!(inspected(&[&moved]).to_string().contains("z `altitude`: 9 nodes"));
 
+    // Layers that vanish.
+    let vanishing = Layers { height: vanishing, w: false, ..moving };
+    assert!(vanishing.check(&mut open_with(&[file("vanishing.nc", &vanishing)], "heights = [-55.0, -35.0, -15.0, -2.0]")) > 200);
+
     // Without `positive`, by the name. Of one time.
     let still = Layers { height: |_, layer, lon| sloping(0, layer, lon), positive: None, moves: false, unit: ("m", 1.0), ..moving };
     assert!(still.check(&mut open_with(&[file("still.nc", &still)], "heights = [-60.0, -30.0, -10.0]")) > 150);
@@ -211,9 +221,23 @@ fn partial_cells_by_a_field_that_is_named() {
     let mut other = whole.dimension("deep", 3);
     other = other.variable("dz", &["deep", "lat", "lon"], Data::F64(vec![1.0; 3 * NX * NY]));
     refused(&[other.write(&dir.path().join("other.nc"))], "z = \"dz\"", &["other.nc", "`dz`", "levels, y and x as those of `u`"]);
+    // A part of the sea that begins at 105 m: nothing is known above.
+    let deep = Layers { height: |_, layer, _| -(105.0 + 10.0 * layer as f64), named: true, ..layers };
+    let mut archive = open_with(&[deep.fixture().write(&dir.path().join("deep.nc"))], "z = \"gdept_0\"");
+    assert_eq!(archive.grid().axes[2].coordinates(), (0..LEVELS).map(|k| -175.0 + 10.0 * k as f64).collect::<Vec<_>>());
+    assert_eq!(archive.read(0).unwrap().missing_nodes(), 0);
+    let mut above = open_with(&[dir.path().join("deep.nc")], "z = \"gdept_0\"\nheights = [-150.0, -50.0]");
+    assert_eq!(above.read(0).unwrap().missing_nodes(), NX * NY);
+
+    let geopotential = Layers { unit: ("m2 s-2", 1.0 / 9.81), ..layers };
+    let file = with_depths(geopotential.fixture()).write(&dir.path().join("geopotential.nc"));
+    refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "`m2 s-2` is no length", "archive.units.z=m"]);
+    let folded = Layers { height: |_, layer, _| -((layer as f64 - 3.2).powi(2) + 5.0), ..layers };
+    let file = with_depths(folded.fixture()).write(&dir.path().join("folded.nc"));
+    refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "go up and down"]);
     let mut empty = with_depths(layers.fixture());
     for variable in empty.variables.iter_mut().filter(|v| v.name == "gdept_0") {
         variable.data = Data::F64(vec![f64::NAN; LEVELS * NX * NY]);
     }
-    refused(&[empty.write(&dir.path().join("empty.nc"))], "z = \"gdept_0\"", &["`gdept_0`", "fewer than two of its levels have heights"]);
+    refused(&[empty.write(&dir.path().join("empty.nc"))], "z = \"gdept_0\"", &["`gdept_0`", "it gives the levels no heights"]);
 }

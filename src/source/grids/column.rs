@@ -136,8 +136,10 @@ impl Columns {
             let height = |k: usize| heights[k * plane + point];
             known.clear();
             known.extend((0..self.order.len()).filter(|&k| height(k).is_finite()));
-            // What was never computed may be filled with one number.
-            let is_filled = matches!(self.places, Places::Field { .. }) && known.windows(2).any(|pair| height(pair[0]) >= height(pair[1]));
+            // What was never computed may be filled with one number. Layers may vanish.
+            let is_filled = matches!(self.places, Places::Field { .. })
+                && (known.windows(2).any(|pair| height(pair[0]) > height(pair[1]))
+                    || known.first().map(|&k| height(k)) == known.last().map(|&k| height(k)));
             if known.is_empty() || is_filled {
                 continue;
             }
@@ -178,9 +180,11 @@ impl Columns {
                     found.extend(at_points(file, heights, level, component, orders, entry)?.into_iter().map(|height| height as f32));
                 }
                 let ends = |point: usize| {
-                    let known = found[point..].iter().step_by(plane).filter(|height| height.is_finite());
-                    let lowest = known.fold(f32::INFINITY, |a, b| a.min(*b));
-                    [lowest, if *is_of_air { f32::NEG_INFINITY } else { 0.0 }]
+                    let mut known = found[point..].iter().step_by(plane).copied().filter(|height| height.is_finite());
+                    let lowest = known.next().unwrap_or(f32::INFINITY);
+                    let [below, highest] =
+                        known.fold([lowest; 2], |[below, highest], z| if z > highest { [highest, z] } else { [below, highest] });
+                    [lowest, if *is_of_air { f32::NEG_INFINITY } else { surface_above(below.into(), highest.into()) as f32 }]
                 };
                 let ends = (0..plane).map(ends).collect();
                 Ok((found, ends))
@@ -209,9 +213,15 @@ impl Columns {
             }
         };
         heights.retain(|z| z.is_finite());
+        // Means over different columns need not ascend.
+        heights.sort_by(f64::total_cmp);
         if !self.is_of_air() {
             heights.retain(|z| *z < 0.0);
-            heights.push(0.0);
+            let reaches = match (&self.places, &heights[..]) {
+                (Places::Field { .. }, [.., below, highest]) => surface_above(*below, *highest) == 0.0,
+                _ => true,
+            };
+            heights.extend(reaches.then_some(0.0));
         }
         heights.dedup();
         Ok(heights)
@@ -236,6 +246,11 @@ impl Columns {
             }
         }
     }
+}
+
+/// Upper end of a column of the sea whose highest levels these are: the surface, 0, if no level is missing between them, so far as their distance tells.
+fn surface_above(below: f64, highest: f64) -> f64 {
+    if highest + (highest - below) >= 0.0 { highest.max(0.0) } else { highest }
 }
 
 /// A level of a field at the points of a component: means of those beside them that are known, if the field has one point more along an axis.
@@ -274,7 +289,8 @@ pub fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: imp
         let middle = (low + high) / 2;
         if height(middle) <= z { low = middle } else { high = middle }
     }
-    let weight = (z - height(low)) / (height(high) - height(low));
+    let thickness = height(high) - height(low);
+    let weight = if thickness > 0.0 { (z - height(low)) / thickness } else { 0.0 };
     Some(value(low) * (1.0 - weight) + value(high) * weight)
 }
 

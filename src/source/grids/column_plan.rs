@@ -311,38 +311,55 @@ impl Planner<'_> {
     }
 
     /// Levels whose heights a field tells.
-    fn by_field(&self, field: usize, [x, y]: [usize; 2], time: Option<usize>, of: usize) -> Result<Columns, SourceError> {
+    fn by_field(&mut self, field: usize, [x, y]: [usize; 2], time: Option<usize>, of: usize) -> Result<Columns, SourceError> {
         let plane = [x, y].map(|d| self.listing().dimensions[d].len);
         let levels = self.variable(field).dimensions.iter().rev().nth(2).copied();
         let mut heights = self.field_of_columns(field, levels, plane, time, of)?;
-        let found = read_component(self.file, &heights, &heights.file_order(), 0)?;
-        // Of a level, over all points.
-        let mean = |level: &[f32]| {
-            let known = level.iter().filter(|z| z.is_finite());
-            let (sum, count) = known.fold((0.0, 0u32), |(sum, count), &z| (sum + f64::from(z), count + 1));
-            sum / f64::from(count)
+        heights.factor = match self.axis_units(Kind::Level, field) {
+            None => {
+                self.note(format!("`{}` has no unit: taken as metres", heights.name));
+                1.0
+            }
+            Some(text) => {
+                let length = Unit::parse(text).filter(Unit::is_length);
+                let what = format!(
+                    "its unit `{text}` is no length, but `z` names it as the heights of levels; --set archive.units.z=m states another"
+                );
+                length.ok_or_else(|| self.misfit(field, what))?.factor
+            }
         };
-        let means: Vec<f64> = found.chunks(found.len() / heights.along(2)).map(mean).collect();
-        let mut order: Vec<usize> = (0..means.len()).filter(|&k| means[k].is_finite()).collect();
-        if order.len() < 2 {
-            return Err(self.misfit(field, "fewer than two of its levels have heights"));
-        }
+        let found = read_component(self.file, &heights, &heights.file_order(), 0)?;
         let variable = self.variable(field);
-        let says_depth = |text: &str| ["depth", "dep"].iter().any(|word| text.to_ascii_lowercase().contains(word));
+        let says_depth = |text: &str| text.to_ascii_lowercase().contains("dep");
         let is_down = match variable.text("positive").map(str::to_ascii_lowercase).as_deref() {
             Some("down") => true,
             Some("up") => false,
             _ => {
-                (says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth))
-                    && order.iter().any(|&k| means[k] > 0.0)
+                let sum: f64 = found.iter().filter(|z| z.is_finite()).map(|&z| f64::from(z)).sum();
+                (says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth)) && sum > 0.0
             }
         };
-        if is_down {
-            heights.factor = -heights.factor;
+        let sign = if is_down { -1.0 } else { 1.0 };
+        heights.factor *= f64::from(sign);
+        // Of each pair of levels: in how many columns more the next one lies above than below.
+        let count = heights.along(2);
+        let levels: Vec<&[f32]> = found.chunks(found.len() / count).collect();
+        let above = |pair: &[&[f32]]| {
+            let steps = pair[0].iter().zip(pair[1]).map(|(low, high)| sign * (high - low)).filter(|step| *step != 0.0 && step.is_finite());
+            steps.map(|step| if step > 0.0 { 1_i64 } else { -1 }).sum::<i64>()
+        };
+        let votes: Vec<i64> = levels.windows(2).map(above).collect();
+        let [is_up, is_back] = [votes.iter().any(|vote| *vote > 0), votes.iter().any(|vote| *vote < 0)];
+        if is_up == is_back {
+            let what = match is_up {
+                true => "its levels go up and down: accepted are heights that ascend or descend from level to level",
+                false => "it gives the levels no heights: its values are missing, or all the same",
+            };
+            return Err(self.misfit(field, what));
         }
-        let rank = |k: usize| if is_down { -means[k] } else { means[k] };
-        order.sort_by(|&a, &b| rank(a).total_cmp(&rank(b)));
-        let is_of_air = order.iter().map(|&k| rank(k)).sum::<f64>() > 0.0;
+        let order = if is_up { (0..count).collect() } else { (0..count).rev().collect() };
+        let known = found.iter().filter(|z| z.is_finite());
+        let is_of_air = known.map(|&z| f64::from(sign * z)).sum::<f64>() > 0.0;
         Ok(Columns { places: Places::Field { heights: Box::new(heights), is_of_air }, order, is_tendency: false, heights: Vec::new() })
     }
 
