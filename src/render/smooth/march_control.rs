@@ -179,6 +179,12 @@ impl MarchControl {
         &mut self.audited
     }
 
+    /// First rays of the two nets of the latest audit, other ones in each: a pixel may be drawn again.
+    pub fn nets(&self) -> [u64; 2] {
+        let first = FIRST_AUDIT_RAY + 2 * NET * self.audits.saturating_sub(1);
+        [first, first + NET]
+    }
+
     /// Takes in audited pixels and what all of them show now. `tone_map` is that of the picture.
     pub fn audit(&mut self, pixels: impl IntoIterator<Item = AuditedPixel>, tone_map: ToneMap) {
         self.audited.extend(pixels);

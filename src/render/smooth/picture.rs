@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
-use super::march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR};
+use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
@@ -194,10 +194,10 @@ impl Picture {
             let [red, green, blue] = sum.radiance;
             [red, green, blue, sum.alpha].map(|c| f64::from(c) * per_ray)
         };
-        let fine = step / AUDIT_STEPS as f32;
+        let (fine, firsts) = (step / AUDIT_STEPS as f32, self.march.nets());
         let look = |&pixel: &u32| {
             let net = |first: u64| mean(first..first + NET, &|j| marched(pixel, j));
-            let nets = [FIRST_AUDIT_RAY, FIRST_AUDIT_RAY + NET].map(net);
+            let nets = firsts.map(net);
             let found = AuditedPixel { pixel, shown: shown(&self.base[pixel as usize]), nets, ..AuditedPixel::default() };
             if mended {
                 // What steps and light volume err, mended rays scatter.

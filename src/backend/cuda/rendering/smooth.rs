@@ -12,8 +12,8 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT, LIT_BY_MARCH,
-    MarchControl, Marching, NET, PAIR, PictureError, TileSums, ToneMap,
+    AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH, MarchControl, Marching,
+    NET, PAIR, PictureError, TileSums, ToneMap,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::ops::Range;
@@ -200,7 +200,8 @@ impl GpuSmooth {
         };
         let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
         // Pixels of earlier audits get the new rays, those of this one all rays and two nets.
-        let of_audit = [0..now, FIRST_AUDIT_RAY..FIRST_AUDIT_RAY + 2 * NET];
+        let [first_net, second_net] = self.control.nets();
+        let of_audit = [0..now, first_net..second_net + NET];
         let followed = self.control.audited_mut().iter().flat_map(|audited| rays(audited.pixel, before..now, step, 0.0));
         let mut checks: Vec<RayCheck> = followed.collect();
         let [of_followed, each] = [checks.len(), (now + 2 * NET) as usize];
