@@ -174,6 +174,15 @@ fn layers_lie_where_their_field_says() {
     assert!((east_north(&snapshot, 0)[0] - 20.0).abs() < 1e-4);
 }
 
+/// A depth that nothing calls one is told by the water.
+#[test]
+fn depths_of_water_are_positive_down() {
+    let dir = tempdir().unwrap();
+    let layers = Layers { name: "zc", positive: None, unit: ("m", 1.0), ..Layers::default() };
+    let mut archive = open_with(&[layers.fixture().write(&dir.path().join("water.nc"))], "heights = [-60.0, -30.0, -10.0]");
+    assert!(layers.check(&mut archive) > 200 && notes(&archive).contains("positive down"));
+}
+
 /// Levels with depths of their own, and a field that says more: it has to be named, and may lie in another file.
 #[test]
 fn partial_cells_by_a_field_that_is_named() {
@@ -232,6 +241,16 @@ fn partial_cells_by_a_field_that_is_named() {
     let geopotential = Layers { unit: ("m2 s-2", 1.0 / 9.81), ..layers };
     let file = with_depths(geopotential.fixture()).write(&dir.path().join("geopotential.nc"));
     refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "`m2 s-2` is no length", "archive.units.z=m"]);
+    let square = Fixture::new(NETCDF4, &[("time", 2), ("layer", 2), ("lat", 3), ("lon", 3)])
+        .axis("time", HOURS, &[0.0, 1.0])
+        .axis("lat", "degrees_north", &[0.0, 1.0, 2.0])
+        .axis("lon", "degrees_east", &[0.0, 1.0, 2.0])
+        .variable("turned", &["layer", "lon", "lat"], Data::F64((0..18).map(f64::from).collect()));
+    let square = ["eastward", "northward"].iter().zip(["u", "v"]).fold(square, |fixture, (along, name)| {
+        let fixture = fixture.variable(name, &["time", "layer", "lat", "lon"], Data::F32(vec![1.0; 36])).with("units", "m s-1");
+        fixture.with("standard_name", format!("{along}_wind").as_str())
+    });
+    refused(&[square.write(&dir.path().join("turned.nc"))], "z = \"turned\"", &["`turned`", "layer, lon, lat", "y and x as the last ones"]);
     let folded = Layers { height: |_, layer, _| -((layer as f64 - 3.2).powi(2) + 5.0), ..layers };
     let file = with_depths(folded.fixture()).write(&dir.path().join("folded.nc"));
     refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "go up and down"]);

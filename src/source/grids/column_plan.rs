@@ -7,6 +7,7 @@ use super::component::{ComponentPlan, Role, read_component};
 use super::dimensions::Extent;
 use super::layout::Layout;
 use super::levels::REFERENCE_PRESSURE;
+use super::mask::is_of_water;
 use super::planner::Planner;
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
@@ -336,7 +337,8 @@ impl Planner<'_> {
             Some("up") => false,
             _ => {
                 let sum: f64 = found.iter().filter(|z| z.is_finite()).map(|&z| f64::from(z)).sum();
-                (says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth)) && sum > 0.0
+                let is_depth = says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth);
+                (is_depth || is_of_water(self.listing(), self.variable(of))) && sum > 0.0
             }
         };
         let sign = if is_down { -1.0 } else { 1.0 };
@@ -534,6 +536,13 @@ impl Planner<'_> {
         let variable = self.variable(field);
         let shape = self.shape(field);
         let rank = shape.len();
+        if rank >= 2
+            && let Some(&[y, x]) = self.variable(of).dimensions.last_chunk::<2>()
+            && (variable.dimensions[rank - 1] == y || variable.dimensions[rank - 2] == x)
+        {
+            let dimensions = self.listing().dimension_names(variable);
+            return Err(self.misfit(field, format!("its dimensions are {dimensions}; accepted are y and x as the last ones")));
+        }
         let fits = rank >= 2 && [0, 1].iter().all(|&k| (plane[k]..=plane[k] + 1).contains(&shape[rank - 1 - k]));
         if !fits {
             let what = format!(
