@@ -362,8 +362,8 @@ RW_FN void fill_node(const FrameScene& scene, const March& march, uint32_t index
 }
 
 // Offset of a ray across (axis 0) or down (1) its pixel: in fours, a point and its quarter turns around the centre. The first point is that of Gauss's
-// rule, the others are those of an additive recurrence in two dimensions. Those of audits are four in each net, one in each row and column, shifted by
-// `random`.
+// rule, the others are those of an additive recurrence in two dimensions. A net of an audit has four points, one in each
+// quarter of the rows and of the columns, shifted by `random`, and each is turned four times.
 RW_FN float ray_offset(uint32_t ray, int axis, const float random[2]) {
     const double gauss = 0.2886751345948129, sqrt_2 = 1.4142135623730951, sqrt_3 = 1.7320508075688772;
     const uint32_t number = ray / 4;

@@ -174,6 +174,25 @@ fn layers_lie_where_their_field_says() {
     assert!((east_north(&snapshot, 0)[0] - 20.0).abs() < 1e-4);
 }
 
+/// Heights that change, in a file of their own: those of the velocity's times.
+#[test]
+fn heights_of_other_times_are_refused() {
+    let dir = tempdir().unwrap();
+    let layers = Layers { w: false, ..Layers::default() };
+    let [mut currents, mut depths] = [layers.fixture(), layers.fixture()];
+    currents.variables.retain(|v| v.name != "depths");
+    depths.variables.retain(|v| !["u", "v"].contains(&v.name.as_str()));
+    let files = [currents.write(&dir.path().join("currents.nc")), depths.write(&dir.path().join("depths.nc"))];
+    let toml = "z = \"depths\"\nheights = [-60.0, -30.0, -10.0]";
+    assert!(layers.check(&mut open_with(&files, toml)) > 200);
+    depths.variables.iter_mut().filter(|v| v.name == "time").for_each(|v| v.data = Data::F64(vec![2.0, 3.0]));
+    let late = depths.write(&dir.path().join("late.nc"));
+    refused(&[&files[0], &late], toml, &["late.nc", "currents.nc", "must have the same times"]);
+    // Cells are those of the file.
+    let whole = layers.fixture().write(&dir.path().join("whole.nc"));
+    refused(&[&whole], "z = \"depths\"\nmetric = \"index\"", &["`depths`", "in metres and not in cells"]);
+}
+
 /// A depth that nothing calls one is told by the water.
 #[test]
 fn depths_of_water_are_positive_down() {

@@ -118,7 +118,7 @@ impl Medium<'_> {
     }
 
     /// Ray `j` of a pixel with steps of at most `step` scene units. `shift` draws a random shift of the ray for each pixel, and follows opaque rays to the end.
-    /// The nets of audits are shifted in any case, each as a whole.
+    /// The nets of audits are shifted in any case, all rays of one by the same random numbers.
     pub fn ray(&self, pixel: u32, j: u64, step: f32, light: ToLight<'_>, shift: bool) -> RaySum {
         let (scene, space) = (self.scene, self.scene.space);
         let of_audit = j >= FIRST_AUDIT_RAY;

@@ -42,7 +42,7 @@ pub struct AuditedPixel {
     /// Radiance and opacity, the mean over all rays of the picture so far.
     pub shown: [f64; 4],
     /// Radiances of two nets of rays at independent random places: the product of the differences to them has the square of the pixel filter's error as
-    /// its mean, since their own errors are independent.
+    /// its mean, since their own errors are independent (to first order in the tone-mapped weighting, whose slope is that towards their mean).
     pub nets: [[f64; 3]; 2],
     /// The first `PAIR` rays, as marched.
     pub pair: [f64; 3],

@@ -35,14 +35,18 @@ impl Part {
 pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<Vec<Group>>, SourceError> {
     let limits = limits(settings);
     let (mut parts, mut helpers, mut helped, mut idle) = (Vec::new(), Vec::new(), HashSet::new(), None);
+    let mut moving: Vec<Part> = Vec::new();
     for path in paths {
         let Ok(file) = DataFile::open(path, None, limits) else { return Ok(None) };
         let Some(content) = content(&file, settings)? else { return Ok(None) };
         if content.components.contains(&true) {
             parts.push(Part { path: path.clone(), content });
         } else if content.helps {
-            // One file of each time may repeat the mesh.
-            if helped.insert(content.fixed) {
+            // Heights that change belong to the components of their times.
+            if !content.seconds.is_empty() {
+                moving.push(Part { path: path.clone(), content });
+            } else if helped.insert(content.fixed) {
+                // One file of each time may repeat the mesh.
                 helpers.push(path.clone());
             }
         } else {
@@ -50,7 +54,7 @@ pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<V
         }
     }
     let whole = |part: &Part| part.content.components[0] && part.content.components[1];
-    if parts.is_empty() || (parts.iter().all(whole) && helpers.is_empty()) {
+    if parts.is_empty() || (parts.iter().all(whole) && helpers.is_empty() && moving.is_empty()) {
         return Ok(None);
     }
     if let Some(idle) = idle {
@@ -70,7 +74,18 @@ pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<V
     let mut found = Vec::new();
     for group in groups {
         check_group(&group, held)?;
-        found.push(group.into_iter().map(|part| part.path).chain(helpers.iter().cloned()).collect());
+        let own = moving.iter().filter(|part| same_times(&part.content.seconds, &group[0].content.seconds)).map(|part| part.path.clone());
+        let own: Vec<PathBuf> = own.collect();
+        if let (true, Some(part)) = (own.is_empty(), moving.first()) {
+            let what = format!(
+                "its heights are of {}, the velocities of {} of {}: heights that change must have the same times",
+                part.content.when,
+                group[0].path.display(),
+                group[0].content.when
+            );
+            return Err(SourceError::file(&part.path, what));
+        }
+        found.push(group.into_iter().map(|part| part.path).chain(own).chain(helpers.iter().cloned()).collect());
     }
     Ok(Some(found))
 }

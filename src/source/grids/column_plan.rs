@@ -178,7 +178,7 @@ impl Planner<'_> {
                 heights if heights.len() < 2 => Err(SourceError::variable(
                     self.path(),
                     columns.teller(),
-                    "it gives the levels no heights: its values are missing, or none is above 0",
+                    "it gives the levels no heights: its values are missing, or all on the other side of the surface",
                 )),
                 heights => Ok(heights),
             },
@@ -233,7 +233,9 @@ impl Planner<'_> {
         {
             let coordinates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
             let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
-            let field = self.field_of_heights(variable, dimension);
+            // Cells are those of the file.
+            let of_cells = self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells;
+            let field = self.field_of_heights(variable, dimension).filter(|_| !of_cells);
             if let (Some(field), true) = (field, field == self.named_heights() || declared.is_none()) {
                 return Ok(Some((dimension, self.by_field(field, [x, y], time, variable)?)));
             }
@@ -285,7 +287,7 @@ impl Planner<'_> {
     fn of_other_levels(&self, of: usize) -> String {
         let [name, dimensions] = [&self.variable(of).name, &self.listing().dimension_names(self.variable(of))].map(Clone::clone);
         format!(
-            "`z` must name a coordinate of one dimension, or heights whose dimensions are levels, y and x as those of `{name}` ({dimensions})"
+            "`z` must name a coordinate of one dimension, or, in metres and not in cells, heights whose dimensions are levels, y and x as those of `{name}` ({dimensions})"
         )
     }
 
@@ -297,7 +299,8 @@ impl Planner<'_> {
         // A mesh may have other names for its dimensions.
         let as_many = |&i: &usize| {
             let len = |d: usize| self.listing().dimensions[d].len;
-            along(&i) || levels(i).is_some_and(|d| len(d) == len(dimension) && !self.variable(variable).dimensions.contains(&d))
+            let is_level = |d: usize| len(d) == len(dimension) && !self.variable(variable).dimensions.contains(&d);
+            along(&i) || (self.variable(i).number.is_number() && levels(i).is_some_and(is_level))
         };
         let unit = |i: usize| self.axis_units(Kind::Level, i).and_then(Unit::parse);
         if let Some(named) = self.named_heights().filter(as_many) {
@@ -355,7 +358,7 @@ impl Planner<'_> {
         if is_up == is_back {
             let what = match is_up {
                 true => "its levels go up and down: accepted are heights that ascend or descend from level to level",
-                false => "it gives the levels no heights: its values are missing, or all the same",
+                false => "it gives the levels no heights at the first time: its values are missing, or all the same",
             };
             return Err(self.misfit(field, what));
         }

@@ -14,7 +14,7 @@ use crate::formats::{DataFile, Listing, Variable};
 pub struct Content {
     /// Whether there is a velocity along x, y and the levels.
     pub components: [bool; 3],
-    /// Times of the components; empty without any.
+    /// Times of the components, or of heights that change; empty without any.
     pub seconds: Vec<f64>,
     /// The times, in words.
     pub when: String,
@@ -59,7 +59,12 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Result<Option<Con
             || holds_mesh(listing)
             || named_heights(listing, settings).is_some(),
     };
-    if let Some(variable) = variables.into_iter().flatten().next() {
+    let moving = |&field: &usize| {
+        let dimensions = &listing.variables[field].dimensions;
+        dimensions.iter().any(|&d| listing.dimensions[d].len > 1 && classify_name(&listing.dimensions[d].name) == Kind::Time)
+    };
+    let heights = named_heights(listing, settings).filter(moving);
+    if let Some(variable) = variables.into_iter().flatten().next().or(heights) {
         // Coordinates may lie in another file.
         let mut own = settings.clone();
         let is_here = |name: &String| listing.find(name).is_some() || listing.dimensions.iter().any(|d| d.name == *name);

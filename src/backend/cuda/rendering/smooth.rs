@@ -187,6 +187,8 @@ impl GpuSmooth {
         }
         let due = self.control.next_rays;
         let began = Instant::now();
+        // If the device fails, the picture starts anew.
+        let shows = self.shows.take();
         let medium = medium(&self.nodes, round, parameters)?;
         let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
         self.march.march(&medium, step, due as u32, round.is_sum())?;
@@ -234,6 +236,7 @@ impl GpuSmooth {
             audited.lit = Some(mean(rays));
         }
         self.control.audit(compared, ToneMap::new(renderer.scene().settings.tone_map));
+        self.shows = shows;
         Ok(began.elapsed().as_secs_f64())
     }
 
