@@ -188,9 +188,73 @@ fn heights_of_other_times_are_refused() {
     depths.variables.iter_mut().filter(|v| v.name == "time").for_each(|v| v.data = Data::F64(vec![2.0, 3.0]));
     let late = depths.write(&dir.path().join("late.nc"));
     refused(&[&files[0], &late], toml, &["late.nc", "currents.nc", "must have the same times"]);
+    // One time a file.
+    let of_time = |time: usize, holds: &[&str]| {
+        let at = Layers {
+            height: if time == 0 { |_, k, lon| sloping(0, k, lon) } else { |_, k, lon| sloping(1, k, lon) },
+            moves: true,
+            ..layers
+        };
+        let mut fixture = at.fixture();
+        fixture.variables.retain(|v| holds.contains(&v.name.as_str()));
+        for (name, len) in fixture.dimensions.iter_mut().filter(|(name, _)| name == "time") {
+            assert_eq!((name.as_str(), *len), ("time", 2));
+            *len = 1;
+        }
+        for variable in fixture.variables.iter_mut().filter(|v| v.dimensions[0] == "time") {
+            variable.data = match &variable.data {
+                Data::F64(_) if variable.name == "time" => Data::F64(vec![time as f64]),
+                Data::F64(values) => Data::F64(values[..values.len() / 2].to_vec()),
+                Data::F32(values) => Data::F32(values[..values.len() / 2].to_vec()),
+                _ => panic!("other numbers"),
+            };
+        }
+        fixture.write(&dir.path().join(format!("{}{time}.nc", holds[0])))
+    };
+    let axes = ["time", "lat", "lon"];
+    let currents = [0, 1].map(|time| of_time(time, &[&["u", "v"][..], &axes].concat()));
+    let depths = [0, 1].map(|time| of_time(time, &[&["depths"][..], &axes].concat()));
+    let [first, second] = [&depths[0], &depths[1]];
+    assert!(layers.check(&mut open_with(&[&currents[0], &currents[1], second, first], toml)) > 200);
+    refused(&[&currents[0], &currents[1], second], toml, &["must have the same times"]);
     // Cells are those of the file.
     let whole = layers.fixture().write(&dir.path().join("whole.nc"));
     refused(&[&whole], "z = \"depths\"\nmetric = \"index\"", &["`depths`", "in metres and not in cells"]);
+}
+
+/// Levels of w that are as many as those of u lie elsewhere.
+#[test]
+fn w_has_heights_of_its_own() {
+    let dir = tempdir().unwrap();
+    let whole = Layers { unit: ("m", 1.0), ..Layers::default() };
+    let read = |fixture: &Fixture, name: &str| {
+        let mut archive = open_with(&[fixture.write(&dir.path().join(name))], "z = \"depths\"\nheights = [-50.0, -30.0, -20.0]");
+        (notes(&archive), archive.read(0).unwrap())
+    };
+    // The lowest face is left out, so that faces are as many as layers.
+    let mut fixture = whole.fixture();
+    fixture.dimensions.iter_mut().filter(|(name, _)| name == "face").for_each(|(_, len)| *len = LEVELS);
+    for variable in fixture.variables.iter_mut().filter(|v| v.dimensions.contains(&"face".to_string())) {
+        let level = NY * NX;
+        let whole = |n: usize| n / level % (LEVELS + 1) < LEVELS;
+        variable.data = match &variable.data {
+            Data::F64(values) => Data::F64(values.iter().enumerate().filter(|(n, _)| whole(*n)).map(|(_, v)| *v).collect()),
+            Data::F32(values) => Data::F32(values.iter().enumerate().filter(|(n, _)| whole(*n)).map(|(_, v)| *v).collect()),
+            _ => panic!("other numbers"),
+        };
+    }
+    let (_, snapshot) = read(&fixture, "own.nc");
+    let known = (0..snapshot.nodes.len()).filter(|&i| !snapshot.nodes[i][3].is_nan());
+    let compared = known.map(|i| {
+        let z = snapshot.grid.axes[2].coordinates()[i / (NX * NY)];
+        assert!((f64::from(snapshot.nodes[i][3]) - z / 1000.0).abs() < 1e-6, "{:?} at {z}", snapshot.nodes[i]);
+    });
+    assert!(compared.count() > 50);
+    // Without heights of its own it is not used.
+    fixture.variables.retain(|v| v.name != "depths_w");
+    let (said, snapshot) = read(&fixture, "none.nc");
+    assert!(said.contains("`w` does not lie on levels that follow the bottom or the ground, and is not used"), "{said}");
+    assert!(snapshot.nodes.iter().all(|node| node[3].is_nan() || node[3] == 0.0));
 }
 
 /// A depth that nothing calls one is told by the water.

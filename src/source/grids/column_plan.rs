@@ -62,7 +62,7 @@ impl Planner<'_> {
     pub fn terrain(&mut self, velocity: &Velocity, extents: &mut [Extent], first: Option<&Layout>) -> Result<Option<Terrain>, SourceError> {
         let time = extents.iter().find(|e| e.kind == Kind::Time).map(|e| e.dimension);
         let u = velocity.u.variable;
-        let found = self.columns(u, time)?;
+        let found = self.columns(u, time, None)?;
         // A level that is selected is read as it is.
         let is_selected = self.variable(u).dimensions.iter().any(|&d| self.settings.entry(&self.listing().dimensions[d].name).is_some());
         if let Some(field) = self.named_heights()
@@ -75,7 +75,7 @@ impl Planner<'_> {
         let Some(extent) = extents.iter_mut().find(|e| e.dimension == dimension) else { return Ok(None) };
         extent.kind = Kind::Level;
         let mut found = vec![Some((dimension, columns))];
-        let v = self.columns(velocity.v.variable, time)?;
+        let v = self.columns(velocity.v.variable, time, None)?;
         if v.is_none() {
             return Err(self.misfit(velocity.v.variable, "it has no levels that follow the bottom or the ground, which u has"));
         }
@@ -83,7 +83,7 @@ impl Planner<'_> {
         found.push(match &velocity.w {
             Some(w) => {
                 let is_tendency = self.is_pressure_tendency(w.variable);
-                self.columns(w.variable, time)?.map(|(dimension, columns)| (dimension, Columns { is_tendency, ..columns }))
+                self.columns(w.variable, time, Some(dimension))?.map(|(dimension, columns)| (dimension, Columns { is_tendency, ..columns }))
             }
             None => None,
         });
@@ -222,8 +222,8 @@ impl Planner<'_> {
         Ok(())
     }
 
-    /// Levels of a variable that follow the bottom, without heights to interpolate to, and their dimension.
-    fn columns(&mut self, variable: usize, time: Option<usize>) -> Result<Option<(usize, Columns)>, SourceError> {
+    /// Levels of a variable that follow the bottom, without heights to interpolate to, and their dimension. `of_u`: see [`Self::field_of_heights`].
+    fn columns(&mut self, variable: usize, time: Option<usize>, of_u: Option<usize>) -> Result<Option<(usize, Columns)>, SourceError> {
         let dims = &self.variable(variable).dimensions;
         let Some((&[y, x], others)) = dims.split_last_chunk::<2>().map(|(rest, plane)| (plane, rest)) else { return Ok(None) };
         let listing = self.listing();
@@ -235,7 +235,7 @@ impl Planner<'_> {
             let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
             // Cells are those of the file.
             let of_cells = self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells;
-            let field = self.field_of_heights(variable, dimension).filter(|_| !of_cells);
+            let field = self.field_of_heights(variable, dimension, of_u).filter(|_| !of_cells);
             if let (Some(field), true) = (field, field == self.named_heights() || declared.is_none()) {
                 return Ok(Some((dimension, self.by_field(field, [x, y], time, variable)?)));
             }
@@ -292,21 +292,24 @@ impl Planner<'_> {
     }
 
     /// A field that tells the height of each point along the levels of a variable: the one that `archive.z` names, else, if the levels have no coordinates in
-    /// metres or pressures, the one among the variable's `coordinates`.
-    fn field_of_heights(&self, variable: usize, dimension: usize) -> Option<usize> {
+    /// metres or pressures, the one among the variable's `coordinates`. `of_u` are the levels of u, if those of the variable may be others (w).
+    fn field_of_heights(&self, variable: usize, dimension: usize, of_u: Option<usize>) -> Option<usize> {
         let levels = |i: usize| self.variable(i).dimensions.iter().rev().nth(2).copied();
         let along = |&i: &usize| levels(i) == Some(dimension) && self.variable(i).number.is_number();
-        // A mesh may have other names for its dimensions.
+        // A mesh may have other names for its dimensions. Levels of w lie elsewhere, although they may be as many.
         let as_many = |&i: &usize| {
             let len = |d: usize| self.listing().dimensions[d].len;
             let is_level = |d: usize| len(d) == len(dimension) && !self.variable(variable).dimensions.contains(&d);
-            along(&i) || (self.variable(i).number.is_number() && levels(i).is_some_and(is_level))
+            along(&i)
+                || (of_u.is_none_or(|of_u| of_u == dimension) && self.variable(i).number.is_number() && levels(i).is_some_and(is_level))
         };
         let unit = |i: usize| self.axis_units(Kind::Level, i).and_then(Unit::parse);
-        if let Some(named) = self.named_heights().filter(as_many) {
+        let named = self.named_heights();
+        if let Some(named) = named.filter(as_many) {
             return Some(named);
         }
-        if self.measured(dimension).coordinate.and_then(unit).is_some_and(|unit| unit.is_length() || unit.is_pressure()) {
+        let is_measured = |unit: Unit| unit.is_length() || unit.is_pressure();
+        if named.is_none() && self.measured(dimension).coordinate.and_then(unit).is_some_and(is_measured) {
             return None;
         }
         let names = self.variable(variable).text("coordinates")?;
@@ -333,6 +336,9 @@ impl Planner<'_> {
             }
         };
         let found = read_component(self.file, &heights, &heights.file_order(), 0)?;
+        if found.is_empty() {
+            return Err(self.misfit(field, "it holds no points"));
+        }
         let variable = self.variable(field);
         let says_depth = |text: &str| text.to_ascii_lowercase().contains("dep");
         let is_down = match variable.text("positive").map(str::to_ascii_lowercase).as_deref() {

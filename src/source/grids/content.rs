@@ -59,9 +59,14 @@ pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Result<Option<Con
             || holds_mesh(listing)
             || named_heights(listing, settings).is_some(),
     };
+    // A mesh has one time at most, of which it says nothing.
+    let is_dated = |d: usize| {
+        let says = |v: &Variable| v.dimensions == [d] && v.units().is_some_and(|units| units.contains(" since "));
+        listing.dimensions[d].len > 1 || listing.matching(says).next().is_some()
+    };
     let moving = |&field: &usize| {
         let dimensions = &listing.variables[field].dimensions;
-        dimensions.iter().any(|&d| listing.dimensions[d].len > 1 && classify_name(&listing.dimensions[d].name) == Kind::Time)
+        dimensions.iter().any(|&d| classify_name(&listing.dimensions[d].name) == Kind::Time && is_dated(d))
     };
     let heights = named_heights(listing, settings).filter(moving);
     if let Some(variable) = variables.into_iter().flatten().next().or(heights) {
