@@ -18,8 +18,8 @@ namespace rw {
 constexpr int BRICK = 8;                 // cells along the edge of a brick
 constexpr float OPAQUE = 1e-4f;          // transmittance below which a ray ends
 constexpr float MOST_POINTS = 65536.0f;  // of quadrature on a ray
-constexpr uint32_t FIRST_AUDIT_RAY = 0x80000000u;  // from here on rays of audits, in nets
-constexpr uint32_t NET = 16;             // rays of a net
+constexpr uint32_t NET = 16;             // rays of a net of an audit
+constexpr uint32_t FIRST_AUDIT_RAY = 0x80000000u;  // from here on rays are those of nets
 
 // Threads of a block that work in phases on shared memory. As host C++ a phase is a loop.
 struct Block {
