@@ -174,6 +174,46 @@ fn layers_lie_where_their_field_says() {
     assert!((east_north(&snapshot, 0)[0] - 20.0).abs() < 1e-4);
 }
 
+/// The atmosphere's levels by geopotentials or pressures, which need not count downwards.
+#[test]
+fn geopotentials_and_pressures_tell_heights() {
+    let dir = tempdir().unwrap();
+    let air = Layers { height: of_air, name: "zg", positive: Some("up"), unit: ("m", 1.0), named: false, moves: false, w: true };
+    let write = |name: &str, unit: &str, of: &dyn Fn(f64) -> f64| {
+        let mut fixture = air.fixture();
+        for variable in &mut fixture.variables {
+            let standard = match variable.name.as_str() {
+                "u" => "eastward_wind",
+                "v" => "northward_wind",
+                "w" => "upward_air_velocity",
+                name => {
+                    if let (true, Data::F64(values)) = (name.starts_with("zg"), &mut variable.data) {
+                        variable.attributes = vec![("units".into(), unit.into())];
+                        values.iter_mut().for_each(|z| *z = of(*z));
+                    }
+                    continue;
+                }
+            };
+            variable.attributes = ["units", "standard_name", "coordinates"]
+                .map(String::from)
+                .into_iter()
+                .zip(["m s-1", standard, if standard == "upward_air_velocity" { "zg_w lat lon" } else { "lat lon" }].map(Into::into))
+                .collect();
+        }
+        fixture.write(&dir.path().join(name))
+    };
+    let heights = "z = \"zg\"\nheights = [800.0, 1200.0, 2000.0, 6000.0, 11000.0]";
+    for (name, unit, of) in [
+        ("geopotential.nc", "m**2 s**-2", &(|z: f64| 9.80665 * z) as &dyn Fn(f64) -> f64),
+        ("pressure.nc", "hPa", &|z: f64| 1000.0 * (-z / 7000.0).exp()),
+    ] {
+        let mut archive = open_with(&[write(name, unit, of)], heights);
+        assert!(air.check(&mut archive) > 300, "{name}");
+        let said = notes(&archive);
+        assert!(said.contains(if unit == "hPa" { "lies at the pressures `zg`" } else { "lies at the heights `zg`" }), "{said}");
+    }
+}
+
 /// Heights that change, in a file of their own: those of the velocity's times.
 #[test]
 fn heights_of_other_times_are_refused() {
@@ -253,7 +293,7 @@ fn w_has_heights_of_its_own() {
     // Without heights of its own it is not used.
     fixture.variables.retain(|v| v.name != "depths_w");
     let (said, snapshot) = read(&fixture, "none.nc");
-    assert!(said.contains("`w` does not lie on levels that follow the bottom or the ground, and is not used"), "{said}");
+    assert!(said.contains("`w` does not lie on the levels of the heights") && said.contains("and is not used"), "{said}");
     assert!(snapshot.nodes.iter().all(|node| node[3].is_nan() || node[3] == 0.0));
 }
 
@@ -321,9 +361,9 @@ fn partial_cells_by_a_field_that_is_named() {
     let mut above = open_with(&[dir.path().join("deep.nc")], "z = \"gdept_0\"\nheights = [-150.0, -50.0]");
     assert_eq!(above.read(0).unwrap().missing_nodes(), NX * NY);
 
-    let geopotential = Layers { unit: ("m2 s-2", 1.0 / 9.81), ..layers };
-    let file = with_depths(geopotential.fixture()).write(&dir.path().join("geopotential.nc"));
-    refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "`m2 s-2` is no length", "archive.units.z=m"]);
+    let pressure = Layers { unit: ("dbar", 1.0), ..layers };
+    let file = with_depths(pressure.fixture()).write(&dir.path().join("pressure.nc"));
+    refused(&[&file], "z = \"gdept_0\"", &["`gdept_0`", "`dbar` is no length or geopotential", "archive.units.z=m"]);
     let square = Fixture::new(NETCDF4, &[("time", 2), ("layer", 2), ("lat", 3), ("lon", 3)])
         .axis("time", HOURS, &[0.0, 1.0])
         .axis("lat", "degrees_north", &[0.0, 1.0, 2.0])

@@ -72,7 +72,7 @@ macro_rules! kinds_of_units {
 }
 kinds_of_units!(
     is_velocity [1, -1, 0], is_pressure_tendency [0, -1, 1], is_length [1, 0, 0], is_pressure [0, 0, 1], is_time [0, 1, 0],
-    is_dimensionless [0, 0, 0]
+    is_geopotential [2, -2, 0], is_dimensionless [0, 0, 0]
 );
 
 /// `m.s-1` is a product, `0.01` a number.

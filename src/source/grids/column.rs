@@ -14,8 +14,9 @@
 //! Other files hold the heights themselves, a number for each point of each level: layers that follow the density, or the last cells above an
 //! uneven bottom.
 
-use super::component::{ComponentPlan, Orders, read_component};
+use super::component::{ComponentPlan, Orders, SquaredErrors, read_component};
 use super::levels::{REFERENCE_PRESSURE, height_of, pressure_at, upward};
+use super::refine::ResamplingError;
 use crate::error::SourceError;
 use crate::formats::DataFile;
 
@@ -68,6 +69,9 @@ impl Formula {
     }
 }
 
+/// Most columns, about, on which the error of interpolation is measured.
+const MEASURED_COLUMNS: usize = 1 << 16;
+
 /// Where the levels of a column lie.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Places {
@@ -83,9 +87,10 @@ pub enum Places {
         /// Height of the surface; without it 0.
         surface: Option<Box<ComponentPlan>>,
     },
-    /// By a field of their heights (x, y, levels), metres.
+    /// By a field of their heights (x, y, levels), metres, or pressures, Pa.
     Field {
         heights: Box<ComponentPlan>,
+        is_pressure: bool,
         /// True if they lie above the sea.
         is_of_air: bool,
     },
@@ -134,13 +139,7 @@ impl Columns {
         let mut known = Vec::with_capacity(self.order.len());
         for point in 0..plane {
             let height = |k: usize| heights[k * plane + point];
-            known.clear();
-            known.extend((0..self.order.len()).filter(|&k| height(k).is_finite()));
-            // What was never computed may be filled with one number. Layers may vanish.
-            let is_filled = matches!(self.places, Places::Field { .. })
-                && (known.windows(2).any(|pair| height(pair[0]) > height(pair[1]))
-                    || known.first().map(|&k| height(k)) == known.last().map(|&k| height(k)));
-            if known.is_empty() || is_filled {
+            if !self.known_levels(&mut known, height) {
                 continue;
             }
             let value = |k: usize| {
@@ -153,6 +152,54 @@ impl Columns {
             }
         }
         Ok(out)
+    }
+
+    /// Finds the levels of a column that have heights, ascending. False if nothing is known there.
+    fn known_levels(&self, known: &mut Vec<usize>, height: impl Fn(usize) -> f32) -> bool {
+        let is_field = matches!(self.places, Places::Field { .. });
+        known.clear();
+        let mut descends = false;
+        for k in (0..self.order.len()).filter(|&k| height(k).is_finite()) {
+            match known.last() {
+                // Layers may vanish.
+                Some(&below) if is_field && height(k) <= height(below) => descends |= height(k) < height(below),
+                _ => known.push(k),
+            }
+        }
+        // What was never computed may be filled with one number.
+        !known.is_empty() && !(is_field && (descends || known.len() == 1))
+    }
+
+    /// Error of interpolation between the heights of the grid, at the levels of components of the first time, and the share of their values that lie below or
+    /// above the heights, or beside one where nothing is known. In archives of many columns, some rows of them are read.
+    ///
+    /// # Errors
+    /// The values cannot be read.
+    pub fn error(file: &DataFile, components: &[ComponentPlan]) -> Result<(ResamplingError, f64), SourceError> {
+        let (mut sums, mut outside, mut all) = (SquaredErrors::default(), 0u64, 0u64);
+        for component in components {
+            let Some(columns) = &component.columns else { continue };
+            let [x, y, _] = component.file_order();
+            let each = (x.len() * y.len()).div_ceil(MEASURED_COLUMNS).min(y.len()).max(1);
+            let y: Vec<usize> = y.into_iter().skip(each / 2).step_by(each).collect();
+            let plane = x.len() * y.len();
+            let orders = [x, y, (0..columns.heights.len()).collect()];
+            let on_grid = columns.read(file, component, &orders, 0)?;
+            let (heights, _) = columns.columns_at(file, component, &orders, 0)?;
+            let [x, y, _] = orders;
+            let values = read_component(file, component, &[x, y, columns.order.clone()], 0)?;
+            for (i, &value) in values.iter().enumerate().filter(|(i, value)| value.is_finite() && heights[*i].is_finite()) {
+                let at = |k: usize| on_grid[k * plane + i % plane];
+                let found =
+                    in_column(heights[i], columns.heights.len(), |k| columns.heights[k] as f32, at).filter(|found| found.is_finite());
+                all += 1;
+                match found {
+                    Some(found) => sums.add(found.into(), value.into()),
+                    None => outside += 1,
+                }
+            }
+        }
+        Ok((ResamplingError::at_points(sums.root_mean_squares()), outside as f64 / all.max(1) as f64))
     }
 
     /// Heights of all levels over the points of a component, and the lower and upper end of each column, metres.
@@ -173,11 +220,12 @@ impl Columns {
                 let heights = levels.iter().flat_map(|level| columns().map(move |column| height(level, column))).collect();
                 Ok((heights, columns().map(|(&ground, &surface)| formula.ends(ground, surface).map(|end| end as f32)).collect()))
             }
-            Places::Field { heights, is_of_air } => {
+            Places::Field { heights, is_pressure, is_of_air } => {
                 let plane = orders[0].len() * orders[1].len();
                 let mut found = Vec::with_capacity(plane * self.order.len());
                 for &level in &self.order {
-                    found.extend(at_points(file, heights, level, component, orders, entry)?.into_iter().map(|height| height as f32));
+                    let values = at_points(file, heights, level, component, orders, entry)?;
+                    found.extend(values.into_iter().map(|value| if *is_pressure { height_of(value) } else { value } as f32));
                 }
                 let ends = |point: usize| {
                     let mut known = found[point..].iter().step_by(plane).copied().filter(|height| height.is_finite());
@@ -206,10 +254,9 @@ impl Columns {
                     |level: &[f64; 2]| mean(&mut grounds.iter().map(|&g| formula.height(*level, *critical_depth, g.into(), 0.0)));
                 levels.iter().map(of_level).collect()
             }
-            Places::Field { heights, .. } => {
-                let [x, y, _] = heights.file_order();
-                let found = read_component(file, heights, &[x, y, self.order.clone()], 0)?;
-                found.chunks(found.len() / self.order.len()).map(|level| mean(&mut level.iter().map(|&z| z.into()))).collect()
+            Places::Field { heights, is_pressure, .. } => {
+                let of_level = |&level: &usize| Ok(mean(&mut heights_of(read_level(file, heights, level, 0)?, *is_pressure)));
+                self.order.iter().map(of_level).collect::<Result<_, SourceError>>()?
             }
         };
         heights.retain(|z| z.is_finite());
@@ -238,10 +285,12 @@ impl Columns {
                 let highest = levels.last().map_or(0.0, |&level| formula.height(level, *critical_depth, lowest, 0.0));
                 Ok([bottom, if formula.is_of_air() { highest } else { surface }])
             }
-            Places::Field { heights, is_of_air } => {
-                let found = read_component(file, heights, &heights.file_order(), 0)?;
-                let known = found.into_iter().filter(|z| z.is_finite()).map(f64::from);
-                let [low, high] = known.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
+            Places::Field { heights, is_pressure, is_of_air } => {
+                let [mut low, mut high] = [f64::INFINITY, f64::NEG_INFINITY];
+                for &level in &self.order {
+                    let known = heights_of(read_level(file, heights, level, 0)?, *is_pressure).filter(|z| z.is_finite());
+                    [low, high] = known.fold([low, high], |[low, high], z| [low.min(z), high.max(z)]);
+                }
                 Ok([low, if *is_of_air { high } else { high.max(0.0) }])
             }
         }
@@ -253,6 +302,17 @@ fn surface_above(below: f64, highest: f64) -> f64 {
     if highest + (highest - below) >= 0.0 { highest.max(0.0) } else { highest }
 }
 
+/// All points of one level of a field at an entry along time. Level by level, a field of any size takes the memory of a plane.
+pub fn read_level(file: &DataFile, plan: &ComponentPlan, level: usize, entry: usize) -> Result<Vec<f32>, SourceError> {
+    let [x, y, _] = plan.file_order();
+    read_component(file, plan, &[x, y, vec![level]], entry)
+}
+
+/// Heights, or those of pressures, metres.
+fn heights_of(values: Vec<f32>, is_pressure: bool) -> impl Iterator<Item = f64> {
+    values.into_iter().map(move |value| if is_pressure { height_of(value.into()) } else { value.into() })
+}
+
 /// A level of a field at the points of a component: means of those beside them that are known, if the field has one point more along an axis.
 fn at_points(
     file: &DataFile,
@@ -262,8 +322,7 @@ fn at_points(
     [x, y, _]: &Orders,
     entry: usize,
 ) -> Result<Vec<f64>, SourceError> {
-    let [all_x, all_y, _] = plan.file_order();
-    let values = read_component(file, plan, &[all_x, all_y, vec![level]], entry)?;
+    let values = read_level(file, plan, level, entry)?;
     let width = plan.along(0);
     let reach = [0, 1].map(|k| usize::from(plan.along(k) > component.along(k)));
     let mut out = Vec::with_capacity(x.len() * y.len());
@@ -289,8 +348,7 @@ pub fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: imp
         let middle = (low + high) / 2;
         if height(middle) <= z { low = middle } else { high = middle }
     }
-    let thickness = height(high) - height(low);
-    let weight = if thickness > 0.0 { (z - height(low)) / thickness } else { 0.0 };
+    let weight = (z - height(low)) / (height(high) - height(low));
     Some(value(low) * (1.0 - weight) + value(high) * weight)
 }
 

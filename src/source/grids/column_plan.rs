@@ -1,5 +1,5 @@
-//! Finds levels that follow the bottom of the sea or the ground: by `formula_terms` (CF conventions, appendix D), by the names of ROMS and CROCO, or by a field
-//! of their heights.
+//! Finds levels that follow the bottom of the sea or the ground: by `formula_terms` (CF conventions, appendix D), by the names of ROMS and CROCO, or by a
+//! [field of their heights](super::column_field).
 
 use super::axes::{AxisPlan, Quantity};
 use super::column::{Columns, Formula, Places};
@@ -7,14 +7,14 @@ use super::component::{ComponentPlan, Role, read_component};
 use super::dimensions::Extent;
 use super::layout::Layout;
 use super::levels::REFERENCE_PRESSURE;
-use super::mask::is_of_water;
 use super::planner::Planner;
-use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
+use super::refine::LARGE;
+use crate::archive_settings::{Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::units::Unit;
 use crate::cf::velocity::{Candidate, Velocity};
 use crate::error::SourceError;
-use crate::formats::{Attribute, Listing, Variable};
+use crate::formats::{Attribute, Variable};
 use ridgewatch_field::Axis;
 use std::sync::Arc;
 
@@ -45,6 +45,11 @@ impl Terrain {
     /// False if a single height is read.
     pub fn is_three(&self) -> bool {
         self.heights.len() > 1
+    }
+
+    /// True if a field tells where levels lie.
+    fn is_by_field(&self) -> bool {
+        self.columns(0).is_some_and(|columns| matches!(columns.places, Places::Field { .. }))
     }
 
     /// Levels of a component.
@@ -87,6 +92,14 @@ impl Planner<'_> {
             }
             None => None,
         });
+        if let (Some(w), Some(Some((_, Columns { is_tendency: true, places: Places::Field { is_pressure: false, .. }, .. })))) =
+            (&velocity.w, found.get(2))
+        {
+            let name = &self.variable(w.variable).name;
+            self.note(format!(
+                "`{name}` is read as w = -H omega / p, with H = 7 km and the pressure of an isothermal atmosphere at each height"
+            ));
+        }
         let Some((_, columns)) = &found[0] else { return Ok(None) };
         let is_of_air = columns.is_of_air();
         if is_of_air && matches!(columns.places, Places::Formula { .. }) {
@@ -116,6 +129,9 @@ impl Planner<'_> {
                     surface.as_ref().map_or("at rest, since no term gives its height".into(), |s| format!("`{}` of each time", s.name));
                 format!("follows the bottom (CF conventions, appendix D; depth `{teller}`, surface {surface})")
             }
+            Places::Field { is_pressure: true, .. } => {
+                format!("lies at the pressures `{teller}` of each point (heights z = -H ln(p / p0) with H = 7 km and p0 = 1000 hPa)")
+            }
             Places::Field { heights, .. } => {
                 let positive = if heights.factor < 0.0 { "down" } else { "up" };
                 format!("lies at the heights `{teller}` of each point (positive {positive})")
@@ -124,6 +140,11 @@ impl Planner<'_> {
         self.note(format!("`{level}` {lie}: each column is interpolated between its own levels {to} ({why}); below {under} it is missing"));
         let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
         Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, is_of_air }))
+    }
+
+    /// True if cells are those of the file, so that its levels are no heights.
+    fn counts_cells(&self) -> bool {
+        self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells
     }
 
     /// True if w is the change of a particle's pressure: by its unit or, without one, by its names.
@@ -203,6 +224,9 @@ impl Planner<'_> {
             () if self.settings.w.is_none() && !terrain.is_of_air() && name.eq_ignore_ascii_case("omega") => {
                 "is the velocity through the levels"
             }
+            () if terrain.columns(2).is_none() && terrain.is_by_field() => {
+                "does not lie on the levels of the heights, nor do its `coordinates` name heights of its own"
+            }
             () if terrain.columns(2).is_none() => "does not lie on levels that follow the bottom or the ground",
             () => return Some(w),
         };
@@ -210,14 +234,26 @@ impl Planner<'_> {
         None
     }
 
-    /// Gives the levels to the components that lie on them.
-    pub fn give_columns(&self, components: &mut [ComponentPlan], terrain: Option<&Terrain>) -> Result<(), SourceError> {
+    /// Gives the levels to the components that lie on them. Of the first file, the error of interpolation between the heights is told.
+    pub fn give_columns(&mut self, components: &mut [ComponentPlan], terrain: Option<&Terrain>, is_first: bool) -> Result<(), SourceError> {
         for (which, component) in components.iter_mut().enumerate() {
             component.columns = terrain.and_then(|terrain| terrain.columns(which));
             if component.columns.is_some() && !component.roles.ends_with(&[Role::Axis(1), Role::Axis(0)]) {
                 let what = "its levels follow the bottom, so that its last dimensions have to be y and x";
                 return Err(SourceError::variable(self.path(), &component.name, what));
             }
+        }
+        if is_first && terrain.is_some_and(Terrain::is_three) {
+            let (error, outside) = Columns::error(self.file, &components[..2])?;
+            let told = format!(
+                "interpolation between these heights errs by {error}, at the first time; {:.1} % of the file's values lie above or below them, or beside a \
+                 missing one",
+                100.0 * outside
+            );
+            self.note(match error.excess() > LARGE {
+                true => format!("WARNING: {told}: --set archive.heights=[...] names more, where the flow changes most"),
+                false => told,
+            });
         }
         Ok(())
     }
@@ -233,9 +269,7 @@ impl Planner<'_> {
         {
             let coordinates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
             let declared = coordinates.iter().copied().find(|&i| formula_of(self.variable(i)).is_some());
-            // Cells are those of the file.
-            let of_cells = self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells;
-            let field = self.field_of_heights(variable, dimension, of_u).filter(|_| !of_cells);
+            let field = self.field_of_heights(variable, dimension, of_u).filter(|_| !self.counts_cells());
             if let (Some(field), true) = (field, field == self.named_heights() || declared.is_none()) {
                 return Ok(Some((dimension, self.by_field(field, [x, y], time, variable)?)));
             }
@@ -278,102 +312,6 @@ impl Planner<'_> {
         Err(SourceError::variable(self.path(), &ground.name, what))
     }
 
-    /// See [`named_heights`].
-    pub fn named_heights(&self) -> Option<usize> {
-        named_heights(self.listing(), self.settings)
-    }
-
-    /// Why a field of heights does not fit a variable.
-    fn of_other_levels(&self, of: usize) -> String {
-        let [name, dimensions] = [&self.variable(of).name, &self.listing().dimension_names(self.variable(of))].map(Clone::clone);
-        format!(
-            "`z` must name a coordinate of one dimension, or, in metres and not in cells, heights whose dimensions are levels, y and x as those of `{name}` ({dimensions})"
-        )
-    }
-
-    /// A field that tells the height of each point along the levels of a variable: the one that `archive.z` names, else, if the levels have no coordinates in
-    /// metres or pressures, the one among the variable's `coordinates`. `of_u` are the levels of u, if those of the variable may be others (w).
-    fn field_of_heights(&self, variable: usize, dimension: usize, of_u: Option<usize>) -> Option<usize> {
-        let levels = |i: usize| self.variable(i).dimensions.iter().rev().nth(2).copied();
-        let along = |&i: &usize| levels(i) == Some(dimension) && self.variable(i).number.is_number();
-        // A mesh may have other names for its dimensions. Levels of w lie elsewhere, although they may be as many.
-        let as_many = |&i: &usize| {
-            let len = |d: usize| self.listing().dimensions[d].len;
-            let is_level = |d: usize| len(d) == len(dimension) && !self.variable(variable).dimensions.contains(&d);
-            along(&i)
-                || (of_u.is_none_or(|of_u| of_u == dimension) && self.variable(i).number.is_number() && levels(i).is_some_and(is_level))
-        };
-        let unit = |i: usize| self.axis_units(Kind::Level, i).and_then(Unit::parse);
-        let named = self.named_heights();
-        if let Some(named) = named.filter(as_many) {
-            return Some(named);
-        }
-        let is_measured = |unit: Unit| unit.is_length() || unit.is_pressure();
-        if named.is_none() && self.measured(dimension).coordinate.and_then(unit).is_some_and(is_measured) {
-            return None;
-        }
-        let names = self.variable(variable).text("coordinates")?;
-        let is_length = |&i: &usize| unit(i).is_some_and(|unit| unit.is_length());
-        names.split_whitespace().filter_map(|name| self.listing().find(name)).filter(along).find(is_length)
-    }
-
-    /// Levels whose heights a field tells.
-    fn by_field(&mut self, field: usize, [x, y]: [usize; 2], time: Option<usize>, of: usize) -> Result<Columns, SourceError> {
-        let plane = [x, y].map(|d| self.listing().dimensions[d].len);
-        let levels = self.variable(field).dimensions.iter().rev().nth(2).copied();
-        let mut heights = self.field_of_columns(field, levels, plane, time, of)?;
-        heights.factor = match self.axis_units(Kind::Level, field) {
-            None => {
-                self.note(format!("`{}` has no unit: taken as metres", heights.name));
-                1.0
-            }
-            Some(text) => {
-                let length = Unit::parse(text).filter(Unit::is_length);
-                let what = format!(
-                    "its unit `{text}` is no length, but `z` names it as the heights of levels; --set archive.units.z=m states another"
-                );
-                length.ok_or_else(|| self.misfit(field, what))?.factor
-            }
-        };
-        let found = read_component(self.file, &heights, &heights.file_order(), 0)?;
-        if found.is_empty() {
-            return Err(self.misfit(field, "it holds no points"));
-        }
-        let variable = self.variable(field);
-        let says_depth = |text: &str| text.to_ascii_lowercase().contains("dep");
-        let is_down = match variable.text("positive").map(str::to_ascii_lowercase).as_deref() {
-            Some("down") => true,
-            Some("up") => false,
-            _ => {
-                let sum: f64 = found.iter().filter(|z| z.is_finite()).map(|&z| f64::from(z)).sum();
-                let is_depth = says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth);
-                (is_depth || is_of_water(self.listing(), self.variable(of))) && sum > 0.0
-            }
-        };
-        let sign = if is_down { -1.0 } else { 1.0 };
-        heights.factor *= f64::from(sign);
-        // Of each pair of levels: in how many columns more the next one lies above than below.
-        let count = heights.along(2);
-        let levels: Vec<&[f32]> = found.chunks(found.len() / count).collect();
-        let above = |pair: &[&[f32]]| {
-            let steps = pair[0].iter().zip(pair[1]).map(|(low, high)| sign * (high - low)).filter(|step| *step != 0.0 && step.is_finite());
-            steps.map(|step| if step > 0.0 { 1_i64 } else { -1 }).sum::<i64>()
-        };
-        let votes: Vec<i64> = levels.windows(2).map(above).collect();
-        let [is_up, is_back] = [votes.iter().any(|vote| *vote > 0), votes.iter().any(|vote| *vote < 0)];
-        if is_up == is_back {
-            let what = match is_up {
-                true => "its levels go up and down: accepted are heights that ascend or descend from level to level",
-                false => "it gives the levels no heights at the first time: its values are missing, or all the same",
-            };
-            return Err(self.misfit(field, what));
-        }
-        let order = if is_up { (0..count).collect() } else { (0..count).rev().collect() };
-        let known = found.iter().filter(|z| z.is_finite());
-        let is_of_air = known.map(|&z| f64::from(sign * z)).sum::<f64>() > 0.0;
-        Ok(Columns { places: Places::Field { heights: Box::new(heights), is_of_air }, order, is_tendency: false, heights: Vec::new() })
-    }
-
     /// Terms that `formula_terms` of the coordinate `level` names.
     fn by_terms(&mut self, variable: usize, dimension: usize, level: usize) -> Result<Option<Terms>, SourceError> {
         let coordinate = self.variable(level);
@@ -387,8 +325,7 @@ impl Planner<'_> {
         let listing = self.listing();
         let find = |term: &str, usual: &str| listing.find(name_of(term).unwrap_or(usual));
         if declared.is_of_air() {
-            // Cells are those of the file.
-            if self.settings.metric == Some(Metric::Index) || self.settings.velocity_unit == VelocityUnit::Cells {
+            if self.counts_cells() {
                 return Ok(None);
             }
             let Some(ground) = find("ps", "ps") else {
@@ -534,7 +471,7 @@ impl Planner<'_> {
 
     /// A length or a pressure over the plane of a variable, on its points or with one more along x or y, and along its levels, if they are given; its last
     /// two dimensions are y and x.
-    fn field_of_columns(
+    pub fn field_of_columns(
         &self,
         field: usize,
         levels: Option<usize>,
@@ -590,11 +527,6 @@ impl Planner<'_> {
             own: Default::default(),
         })
     }
-}
-
-/// The field of heights that `archive.z` names.
-pub fn named_heights(listing: &Listing, settings: &ArchiveSettings) -> Option<usize> {
-    listing.find(settings.z.as_ref()?).filter(|&field| listing.variables[field].dimensions.len() >= 3)
 }
 
 /// What a formula needs.

@@ -1,6 +1,6 @@
 //! What one file of an archive holds, for files that have to be read together.
 
-use super::column_plan::named_heights;
+use super::column_field::named_heights;
 use super::mask::holds_mask;
 use super::planner::Planner;
 use super::unstructured_plan::holds_mesh;

@@ -368,7 +368,7 @@ impl Planner<'_> {
             None => {}
         }
         components.iter_mut().zip(own_levels).for_each(|(component, own)| component.own[2] = Some(own));
-        self.give_columns(&mut components, terrain.as_ref())?;
+        self.give_columns(&mut components, terrain.as_ref(), first.is_none())?;
 
         let points = &points[..components.len()];
         let same_shapes = |l: &&Layout| l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));

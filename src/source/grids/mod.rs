@@ -11,6 +11,7 @@
 
 mod axes;
 mod column;
+mod column_field;
 mod column_plan;
 mod component;
 mod content;

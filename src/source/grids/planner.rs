@@ -1,6 +1,7 @@
 //! The planner of one file, and what all plans share.
 
 use super::axes::{AxisPlan, Quantity};
+use super::column_field::Told;
 use super::column_plan::Terrain;
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
@@ -22,11 +23,13 @@ pub struct Planner<'a> {
     pub settings: &'a ArchiveSettings,
     /// See [`super::layout::Layout::notes`].
     pub notes: Vec<String>,
+    /// Fields of heights that were looked at, by their variable.
+    pub fields_of_heights: Vec<(usize, Told)>,
 }
 
 impl<'a> Planner<'a> {
     pub fn new(file: &'a DataFile, settings: &'a ArchiveSettings) -> Self {
-        Self { file, settings, notes: Vec::new() }
+        Self { file, settings, notes: Vec::new(), fields_of_heights: Vec::new() }
     }
 
     pub fn listing(&self) -> &'a Listing {

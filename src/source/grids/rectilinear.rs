@@ -128,7 +128,7 @@ impl Planner<'_> {
         let of_w = roles.get(2).map_or(&[][..], Vec::as_slice);
         components.extend(self.vertical_component(w, of_w, axes.get(2), three, terrain.as_ref())?);
         components.iter_mut().zip(places).for_each(|(component, own)| component.own = own);
-        self.give_columns(&mut components, terrain.as_ref())?;
+        self.give_columns(&mut components, terrain.as_ref(), first.is_none())?;
         let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: None, notes: self.notes })
     }

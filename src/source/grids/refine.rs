@@ -61,9 +61,12 @@ impl ResamplingError {
 impl fmt::Display for ResamplingError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let percent = |error: f64| 100.0 * error / self.velocity.max(f64::MIN_POSITIVE);
-        write!(f, "{:.3} m/s of {:.3} m/s ({:.1} %) at the file's own points", self.at_points, self.velocity, percent(self.at_points))?;
+        // Slow flows have more decimals.
+        let digits = if self.velocity > 0.0 { (1.0 - self.velocity.log10().floor()).clamp(3.0, 9.0) as usize } else { 3 };
+        let Self { at_points, velocity, .. } = self;
+        write!(f, "{at_points:.digits$} m/s of {velocity:.digits$} m/s ({:.1} %) at the file's own points", percent(*at_points))?;
         match self.between {
-            Some(between) => write!(f, ", {between:.3} m/s ({:.1} %) between them", percent(between)),
+            Some(between) => write!(f, ", {between:.digits$} m/s ({:.1} %) between them", percent(between)),
             None => Ok(()),
         }
     }
