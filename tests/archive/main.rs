@@ -9,6 +9,7 @@ mod heights;
 mod hemispheres;
 mod http;
 mod hybrid;
+mod integrated;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod land;

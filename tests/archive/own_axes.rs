@@ -1,7 +1,7 @@
 //! Components on coordinates of their own: Arakawa's C grid in rows, and vertical velocities between the levels of the others.
 
+use crate::integrated::Compared;
 use crate::kit::netcdf::*;
-use crate::real::{independent, report};
 use crate::{HOURS, inspected, notes, open, open_with, refused};
 use ridgewatch::field::{Geometry, Snapshot};
 use ridgewatch::source::SnapshotSource;
@@ -260,11 +260,13 @@ fn faces_agree_with_an_independent_integration() {
         let (a, b, c) = (x / 60.0 + 0.4 * time, y / 90.0 - 0.3 * time, z / 8.0);
         0.02 * [a.sin() * b.cos() + 0.4 * c.sin(), 0.7 * (a.cos() - b).sin() + 0.2 * c.cos(), 0.03 * (a + b).sin() * c.cos()][which]
     };
-    let file = staggered(field).write(&dir.path().join("faces.nc"));
-    let pairs = independent("rows", std::slice::from_ref(&file), 3600.0);
-    let (relative, correlation) = report("faces", 3600.0, &pairs);
+    let files = [staggered(field).write(&dir.path().join("faces.nc"))];
+    let compared = Compared { kind: "rows", files: &files, keys: "", tau: 3600.0 };
+    let (relative, correlation) = compared.exactly().report("faces");
     // The same interpolant.
     assert!(relative < 1e-6 && correlation > 0.999_999, "{relative} {correlation}");
+    let (relative, correlation) = compared.by_default().report("faces, by default");
+    assert!(relative < 0.03 && correlation > 0.99, "{relative} {correlation}");
 }
 
 /// NEMO: u and v have dimensions of their own for the same levels. One level is the same in both.

@@ -1,16 +1,16 @@
 //! Real archives (`RIDGEWATCH_DATA`, by default `../shared/data`) through the whole loop, or to the right error, and against an integration
 //! by other tools: `make test-data`.
 
+use crate::integrated::{Compared, Pairs};
 use crate::kit::flow::{quasi_random, trace, window};
 use crate::kit::program::{self, project, records, set, text};
 use crate::{inspected, open, refused};
 use ridgewatch::field::{DomainPoint, Geometry, UnitPoint};
-use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Precision, Steps, VelocitySource, cpu_tracer};
 use ridgewatch::publish::read_exr;
 use ridgewatch::render::Film;
 use ridgewatch::source::{Metric, SnapshotSource};
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 /// A file of the collection, which must exist: without it, `make test` leaves these tests out and says so.
 fn data(name: &str) -> PathBuf {
@@ -129,71 +129,6 @@ fn what_cannot_be_traced_says_why() {
     }
 }
 
-/// Pairs of log-stretches that are compared.
-const PAIRS: usize = 50;
-
-/// Log-stretches at 50 seeds that live the whole tau, neighbours included: from this program and from tests/independent/ftle.py.
-pub fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
-    let python = std::env::var_os("RIDGEWATCH_PYTHON").map_or_else(|| project(".venv/bin/python"), PathBuf::from);
-    assert!(python.exists(), "{} is not there: make test-data installs it", python.display());
-    let mut archive = open(files);
-    let begin = archive.times()[archive.times().len() - 1];
-    let source = VelocitySource::Window(window(&mut archive));
-    let map = FlowMap {
-        direction: Direction::Backward,
-        integrator: Integrator::DormandPrince,
-        precision: Precision::F64,
-        boundary: Boundary::Stop,
-        ..FlowMap::tangent(tau, 1)
-    };
-    let tracer = cpu_tracer(source.clone(), &map, begin).unwrap();
-    // Seeds that stop are left out. More remain than are needed, since a neighbour of some stops.
-    let seeds: Vec<DomainPoint> = (0..2000).map(|i| tracer.domain().from_unit(UnitPoint(quasi_random(i).map(|c| c as f32)))).collect();
-    let out = trace(&source, &map, begin, &seeds, Extras::default());
-    let chosen: Vec<usize> =
-        (0..seeds.len()).filter(|&i| out.lifetime_share[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
-    assert_eq!(chosen.len(), 2 * PAIRS);
-    let task = serde_json::json!({
-        "kind": kind,
-        "files": archive.files().map(|f| f.display().to_string()).collect::<Vec<_>>(),
-        "count": PAIRS,
-        "points": chosen.iter().map(|&i| seeds[i].0.map(f64::from)).collect::<Vec<_>>(),
-        "from": begin,
-        "tau": -tau,
-    });
-    let output = program::run_with_input(Command::new(python).arg(project("tests/independent/ftle.py")), &task.to_string()).success();
-    let theirs: Vec<serde_json::Value> = serde_json::from_str(&output.stdout).unwrap();
-    let pairs: (Vec<f64>, Vec<f64>) =
-        chosen.iter().zip(&theirs).filter_map(|(&i, theirs)| theirs.as_f64().map(|t| (out.log_stretch_f64[i], t))).unzip();
-    println!("{kind}: {} of {} points are left out, since a neighbour stops", theirs.len() - PAIRS, theirs.len());
-    for (&i, theirs) in chosen.iter().zip(&theirs) {
-        assert_ne!(theirs, "seed", "{kind}: {:?} lives here and not there", seeds[i]);
-    }
-    assert_eq!(pairs.0.len(), PAIRS);
-    pairs
-}
-
-/// Root mean square and median difference of the FTLE, per second, root mean square FTLE, correlation.
-pub fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, f64) {
-    let n = ours.len() as f64;
-    let mean = |f: &dyn Fn(usize) -> f64| (0..ours.len()).map(f).sum::<f64>() / n;
-    let rms = mean(&|i| (ours[i] - theirs[i]).powi(2)).sqrt();
-    let size = mean(&|i| theirs[i].powi(2)).sqrt();
-    let mut apart: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).collect();
-    apart.sort_by(f64::total_cmp);
-    let (a, b) = (mean(&|i| ours[i]), mean(&|i| theirs[i]));
-    let correlation =
-        mean(&|i| (ours[i] - a) * (theirs[i] - b)) / (mean(&|i| (ours[i] - a).powi(2)) * mean(&|i| (theirs[i] - b).powi(2))).sqrt();
-    println!(
-        "{name}: {n} points, tau {tau} s: FTLE differs by {:.2e} 1/s root mean square, {:.2e} median, {:.2e} at most, of {:.2e}; correlation {correlation:.6}",
-        rms / tau,
-        apart[apart.len() / 2] / tau,
-        apart[apart.len() - 1] / tau,
-        size / tau
-    );
-    (rms / size, correlation)
-}
-
 #[test]
 #[ignore = "needs real archives: make test-data"]
 fn automatic_steps_see_the_kinks_of_linear_interpolation() {
@@ -227,6 +162,18 @@ fn automatic_steps_see_the_kinks_of_linear_interpolation() {
     }
 }
 
+/// Compares the FTLE with ftle.py: it differs by a share of `most`, and by 3 % with the defaults of a scene. Returns the former pairs.
+fn agreeing(kind: &str, files: &Path, tau: f64, most: f64) -> Pairs {
+    let files = [files.to_owned()];
+    let compared = Compared { kind, files: &files, keys: "", tau };
+    let pairs = compared.exactly();
+    let (relative, correlation) = pairs.report(kind);
+    assert!(relative < most && correlation > 1.0 - most, "{kind}: {relative} {correlation}");
+    let (relative, correlation) = compared.by_default().report(&format!("{kind}, by default"));
+    assert!(relative < 0.03 && correlation > 0.99, "{kind}: {relative} {correlation}");
+    pairs
+}
+
 /// FTLE, per second, of log-stretches.
 fn per_second(log_stretch: &[f64], tau: f64) -> Vec<f64> {
     log_stretch.iter().map(|s| s / tau).collect()
@@ -236,10 +183,7 @@ fn per_second(log_stretch: &[f64], tau: f64) -> Vec<f64> {
 #[ignore = "needs real archives: make test-data"]
 fn globcurrent_agrees_with_an_independent_integration() {
     let (files, tau) = (data("globcurrent").join("*.nc"), 5.0 * 86_400.0);
-    let pairs = independent("globcurrent", std::slice::from_ref(&files), tau);
-    let (relative, correlation) = report("GlobCurrent", tau, &pairs);
-    // This program interpolates vectors in space, the other one east and north: they differ by the square of a cell.
-    assert!(relative < 0.011 && correlation > 0.9999, "{relative} {correlation}");
+    let pairs = agreeing("globcurrent", &files, tau, 1e-3);
     // A point is on land if one of the 4 x 4 nodes of cubic interpolation, the default in two dimensions, is missing.
     let mut archive = open(&[&files]);
     let snapshot = archive.read(59).unwrap();
@@ -248,29 +192,24 @@ fn globcurrent_agrees_with_an_independent_integration() {
     let is_land = |i: usize, j: usize| read(j, ny).any(|y| read(i, nx).any(|x| snapshot.nodes[y * nx + x][3].is_nan()));
     let cells = ((nx - 1) * (ny - 1)) as f64;
     let land = (0..ny - 1).map(|j| (0..nx - 1).filter(|&i| is_land(i, j)).count()).sum::<usize>() as f64 / cells;
-    looks_right("GlobCurrent", &replay(&files, tau), &per_second(&pairs.1, tau), land - 0.005..=land + 0.005);
+    looks_right("GlobCurrent", &replay(&files, tau), &per_second(&pairs.theirs, tau), land - 0.005..=land + 0.005);
 }
 
 #[test]
 #[ignore = "needs real archives: make test-data"]
 fn era5_agrees_with_an_independent_integration() {
     let (files, tau) = (data("era5_utm32_2025_05_01_00.nc").with_file_name("era5_utm32_*.nc"), 7200.0);
-    let pairs = independent("era5", std::slice::from_ref(&files), tau);
-    let (relative, correlation) = report("ERA5", tau, &pairs);
-    // The same interpolant.
-    assert!(relative < 1e-6 && correlation > 0.999_999_9, "{relative} {correlation}");
+    let pairs = agreeing("era5", &files, tau, 1e-6);
     // The rim is visible behind transparent parts; 0.040 was measured.
-    looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.1, tau), 0.03..=0.05);
+    looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.theirs, tau), 0.03..=0.05);
 }
 
 #[test]
 #[ignore = "needs real archives: make test-data"]
 fn wrf_agrees_with_an_independent_integration() {
     let (file, tau) = (data("wrf_katrina_uvw_4t.nc"), 3600.0);
-    let pairs = independent("wrf", std::slice::from_ref(&file), tau);
-    let (relative, correlation) = report("WRF", tau, &pairs);
     // Horizontally the same interpolant; vertically fixed heights here, the levels of each column there.
-    assert!(relative < 0.024 && correlation > 0.9992, "{relative} {correlation}");
+    let pairs = agreeing("wrf", &file, tau, 0.024);
     // Outside of the nest; 0.128 was measured.
-    looks_right("WRF", &replay(&file, tau), &per_second(&pairs.1, tau), 0.1..=0.16);
+    looks_right("WRF", &replay(&file, tau), &per_second(&pairs.theirs, tau), 0.1..=0.16);
 }

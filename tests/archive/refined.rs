@@ -1,11 +1,12 @@
 //! How fine the grid of a mesh is made: turned, stretched and sheared meshes whose flow is known, against interpolation in the mesh's own index
 //! space and an integration of its own.
 
+use crate::integrated::default_map;
 use crate::kit::flow::{quasi_random, stretches, trace, window};
 use crate::kit::netcdf::*;
 use crate::{HOURS, inspected, notes, open, open_with};
 use ridgewatch::field::{DomainPoint, EARTH_RADIUS, Snapshot};
-use ridgewatch::flow::{Boundary, Extras, FlowMap, Integrator, Precision, VelocitySource};
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, VelocitySource};
 use ridgewatch::source::{Archive, SnapshotSource};
 use std::path::{Path, PathBuf};
 use tempfile::tempdir;
@@ -184,8 +185,9 @@ fn places(count: usize) -> impl Iterator<Item = [f64; 2]> {
     (0..count).map(quasi_random).map(|q| [MIDDLE[0] + 4.0 * (q[0] - 0.5), MIDDLE[1] + 3.0 * (q[1] - 0.5)])
 }
 
-/// Errors of the velocity against the mesh and against the flow itself, and of the FTLE against the integration in the mesh.
-fn errors(sea: &Sea, archive: &mut Archive) -> [f64; 3] {
+/// Errors of the velocity against the mesh and against the flow itself, and of the FTLE against the integration in the mesh: by linear interpolation, and with
+/// the defaults of a scene, of `file`.
+fn errors(sea: &Sea, archive: &mut Archive, file: &Path) -> [f64; 4] {
     let snapshot = archive.read(0).unwrap();
     let compare = |truth: &dyn Fn(f64, f64) -> [f64; 2]| {
         let at = |p: [f64; 2]| {
@@ -196,17 +198,22 @@ fn errors(sea: &Sea, archive: &mut Archive) -> [f64; 3] {
     };
     let slab = snapshot.grid.slab;
     let seeds: Vec<DomainPoint> = places(40).map(|p| DomainPoint([p[0] as f32, p[1] as f32, (0.5 * (slab.0 + slab.1)) as f32])).collect();
-    let map = FlowMap {
+    let linear = FlowMap {
         integrator: Integrator::DormandPrince,
         precision: Precision::F64,
         boundary: Boundary::Stop,
         ..FlowMap::tangent(HOURS_LONG * 3600.0, 1)
     };
-    let begin = archive.times()[0];
-    let traced = trace(&VelocitySource::Window(window(archive)), &map, begin, &seeds, Extras::default());
-    assert!(traced.lifetime_share.iter().all(|&share| share == 1.0), "a particle stopped");
-    let pairs = stretches(&traced).into_iter().zip(&seeds).map(|(found, seed)| (found, sea.stretch([0, 1].map(|k| f64::from(seed.0[k])))));
-    [compare(&|x, y| sea.in_mesh(x, y)), compare(&|x, y| (sea.flow)(x, y)), relative(&pairs.collect::<Vec<_>>())]
+    // Forward, as the integration in the mesh.
+    let default = FlowMap { direction: Direction::Forward, ..default_map(&[file.to_owned()], "", HOURS_LONG * 3600.0) };
+    let (begin, window) = (archive.times()[0], window(archive));
+    let truth: Vec<f64> = seeds.iter().map(|seed| sea.stretch([0, 1].map(|k| f64::from(seed.0[k])))).collect();
+    let [linear, default] = [linear, default].map(|map| {
+        let traced = trace(&VelocitySource::Window(window.clone()), &map, begin, &seeds, Extras::default());
+        assert!(traced.lifetime_share.iter().all(|&share| share == 1.0), "a particle stopped");
+        relative(&stretches(&traced).into_iter().zip(truth.iter().copied()).collect::<Vec<_>>())
+    });
+    [compare(&|x, y| sea.in_mesh(x, y)), compare(&|x, y| (sea.flow)(x, y)), linear, default]
 }
 
 #[test]
@@ -222,9 +229,9 @@ fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
     ] {
         let file = sea.write(&dir.path().join(format!("{name}.nc")));
         let mut refined = open(&[&file]);
-        let [velocity, exact, ftle] = errors(&sea, &mut refined);
+        let [velocity, exact, ftle, default] = errors(&sea, &mut refined, &file);
         let mut kept = open_with(&[&file], &format!("resolution = {coarse}"));
-        let [coarse_velocity, coarse_exact, coarse_ftle] = errors(&sea, &mut kept);
+        let [coarse_velocity, coarse_exact, coarse_ftle, _] = errors(&sea, &mut kept, &file);
         // What interpolation in the mesh itself errs by.
         let at = |p: [f64; 2]| {
             let [x, y] = [0, 1].map(|k| p[k] - MIDDLE[k]);
@@ -233,7 +240,7 @@ fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
         };
         let own = relative(&places(3000).flat_map(at).collect::<Vec<_>>());
         println!(
-            "{name}: velocity {velocity:.4} of the mesh's, {exact:.4} of the flow (the mesh {own:.4}), FTLE {ftle:.4}; with {coarse} {coarse_velocity:.4}, \
+            "{name}: velocity {velocity:.4} of the mesh's, {exact:.4} of the flow (the mesh {own:.4}), FTLE {ftle:.4}, by default {default:.4}; with {coarse} {coarse_velocity:.4}, \
              {coarse_exact:.4}, {coarse_ftle:.4}; {:?} and {:?} nodes",
             refined.grid().shape(),
             kept.grid().shape()
@@ -244,6 +251,7 @@ fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
         assert!(exact < own + 0.016, "{name}: {exact} and {own}");
         // Across the edges of triangles the gradient jumps, and a grid does not follow them.
         let most = if sea.triangles { 0.05 } else { 0.03 };
+        assert!(default < most, "{name}, by default: {default}");
         assert!(ftle < most && coarse_ftle > 1.5 * ftle, "{name}: {ftle} and {coarse_ftle}");
         let report = inspected(&[&file]).resampling.unwrap();
         println!("  {report:?}");
