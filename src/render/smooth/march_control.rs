@@ -17,9 +17,9 @@ const MIN_STEP: f32 = 1.0 / 16.0;
 const SHARE: f64 = 0.1;
 /// Once the error of the pixel filter is this share of what it may be, no more rays are marched.
 const SPARE: f64 = 0.25;
-/// Audits that a picture gets in any case, one a round.
+/// Audits that a picture gets in any case with steps of one size, one a round.
 const MIN_AUDITS: u64 = 4;
-/// Pixels per audit. Most of the error is at edges, in few of them.
+/// Pixels per audit, if there are as many. Most of the error is at edges, in few of them.
 const AUDITED_PIXELS: u64 = 1024;
 /// Numbers from which on the rays of audits count. No picture has as many.
 pub const FIRST_AUDIT_RAY: u64 = 1 << 31;
@@ -113,8 +113,9 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Number of audits so far.
+    /// Number of audits so far, and when the steps became what they are.
     audits: u64,
+    audits_before: u64,
     /// The pixels of these audits.
     audited: Vec<AuditedPixel>,
     /// Squared errors of the pixel filter, of the steps and of the light volume, and twice the product of the last two.
@@ -138,7 +139,18 @@ pub enum Marching {
 impl Default for MarchControl {
     fn default() -> Self {
         let [filter, steps, light, both] = [Mean::default(); 4];
-        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, audits: 0, audited: Vec::new(), filter, steps, light, both }
+        Self {
+            rays: 0,
+            next_rays: MIN_RAYS,
+            step: FIRST_STEP,
+            audits: 0,
+            audits_before: 0,
+            audited: Vec::new(),
+            filter,
+            steps,
+            light,
+            both,
+        }
     }
 }
 
@@ -160,18 +172,23 @@ impl MarchControl {
 
     /// Returns true if rays are to be marched or pixels to be audited.
     pub fn is_due(&self) -> bool {
-        self.next_rays > 0 || self.audits < MIN_AUDITS
+        self.next_rays > 0 || self.audits < self.audits_before + MIN_AUDITS
     }
 
-    /// Pixels of the next audit, others in each.
+    /// Pixels of the next audit, others in each: one in each of as many equal parts of the picture, so that none is drawn twice. In random order, since some
+    /// quantities are measured on the first few.
     pub fn audit_pixels(&mut self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
         let first = self.audits * AUDITED_PIXELS;
         self.audits += 1;
-        let pixel = |i: u64| {
-            let word = random.words((first + i) as u32, u32::MAX, AUDIT_DIMENSION)[0];
-            ((u64::from(word) * pixels as u64) >> 32) as u32
+        let (pixels, count) = (pixels as u64, AUDITED_PIXELS.min(pixels as u64));
+        let start = |part: u64| part * pixels / count;
+        let draw = |part: u64| {
+            let [within, order, ..] = random.words((first + part) as u32, u32::MAX, AUDIT_DIMENSION);
+            (order, (start(part) + ((u64::from(within) * (start(part + 1) - start(part))) >> 32)) as u32)
         };
-        (0..AUDITED_PIXELS).map(pixel).collect()
+        let mut drawn: Vec<(u32, u32)> = (0..count).map(draw).collect();
+        drawn.sort_unstable();
+        drawn.into_iter().map(|(_, pixel)| pixel).collect()
     }
 
     /// The pixels that have been audited. Their `shown` follows the picture.
@@ -236,7 +253,7 @@ impl MarchControl {
         }
         if self.quadrature(0) > allowed && self.step > MIN_STEP {
             let next_rays = self.rays.max(MIN_RAYS);
-            *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
+            *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
         }
         if self.filter.value(0) > allowed && self.rays < MAX_RAYS {
@@ -244,5 +261,61 @@ impl MarchControl {
             return Marching::More;
         }
         Marching::Enough
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn audits_draw_each_part_of_a_picture_once() {
+        let random = FrameRandom::new(5, 3);
+        let mut control = MarchControl::default();
+        let mut first_ones = Vec::new();
+        for pixels in [12_800_usize, 1500, 1024, 700, 1] {
+            let [mut one, other] = [0; 2].map(|_| control.audit_pixels(&random, pixels));
+            // Another order, and other pixels where a part has several.
+            assert!(one != other || pixels == 1);
+            first_ones.extend(one[..24.min(one.len())].iter().map(|&pixel| f64::from(pixel) / pixels as f64));
+            one.sort_unstable();
+            let count = pixels.min(1024);
+            assert_eq!(one.len(), count);
+            assert!(
+                one.iter()
+                    .enumerate()
+                    .all(|(part, &pixel)| (part * pixels / count..(part + 1) * pixels / count).contains(&(pixel as usize)))
+            );
+        }
+        // The first ones lie anywhere: in the upper half as often as in the lower, within four standard deviations.
+        let upper = first_ones.iter().filter(|&&place| place < 0.5).count() as f64;
+        let half = first_ones.len() as f64 / 2.0;
+        assert!((upper - half).abs() < 4.0 * (half / 2.0).sqrt(), "{upper} of {}", first_ones.len());
+    }
+
+    /// After steps were halved, the statement rests on as many audits as at first.
+    #[test]
+    fn smaller_steps_are_audited_as_often() {
+        let random = FrameRandom::new(1, 0);
+        let mut control = MarchControl::default();
+        let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [0.5; 3], nets: [[1.0; 3]; 2], ..AuditedPixel::default() };
+        let rounds = |control: &mut MarchControl, others: f64| {
+            let mut count = 0;
+            while control.is_due() {
+                control.audit_pixels(&random, 5000);
+                control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
+                control.rays += control.next_rays;
+                count += 1;
+                if control.decide(others, true) == Marching::Anew {
+                    return (count, true);
+                }
+            }
+            (count, false)
+        };
+        // Nothing is asked of the march.
+        assert_eq!(rounds(&mut control, 1e6), (MIN_AUDITS, false));
+        control.next_rays = MIN_RAYS;
+        assert_eq!(rounds(&mut control, 1e-6), (1, true));
+        assert_eq!((control.step, rounds(&mut control, 1e6)), (0.5 * FIRST_STEP, (MIN_AUDITS, false)));
     }
 }
