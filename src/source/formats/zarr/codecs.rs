@@ -19,6 +19,9 @@ pub enum Step {
 
 /// The latest format of Blosc 1, in the first byte.
 const BLOSC_1: u8 = 2;
+/// Flags in the third byte of its header: bits were shuffled; the data are stored as they are.
+const BLOSC_BITSHUFFLE: u8 = 4;
+const BLOSC_STORED: u8 = 2;
 /// Names of the codecs, for messages.
 pub const ACCEPTED: &str = "gzip, zlib, zstd, blosc, lz4, crc32c, shuffle, bitround, bytes, transpose and sharding_indexed";
 
@@ -62,8 +65,18 @@ impl Step {
                 let bytes = blusc::blosc1_cbuffer_validate(&data, data.len()).map_err(|()| "blosc: its header is damaged")?;
                 within(bytes as u64, most)?;
                 let mut out = vec![0; bytes];
+                let is_bitshuffled = data[2] & (BLOSC_BITSHUFFLE | BLOSC_STORED) == BLOSC_BITSHUFFLE;
+                // The crate puts bits back wrongly where the elements of a block are no multiple of eight.
+                data[2] &= !BLOSC_BITSHUFFLE;
                 let unpacked = blusc::blosc1_decompress(&data, &mut out);
-                if usize::try_from(unpacked) == Ok(bytes) { Ok(out) } else { Err("blosc: it is damaged".into()) }
+                if usize::try_from(unpacked) != Ok(bytes) {
+                    return Err("blosc: it is damaged".into());
+                }
+                if is_bitshuffled && let Some((block, _)) = data[8..].split_first_chunk() {
+                    let width = usize::from(data[3]).max(1);
+                    out.chunks_mut((u32::from_le_bytes(*block) as usize).max(1)).for_each(|block| unshuffle_bits(block, width));
+                }
+                Ok(out)
             }
             Self::Lz4 => {
                 let (length, packed) = data.split_first_chunk().ok_or("lz4: it is shorter than its header")?;
@@ -91,6 +104,25 @@ impl Step {
             }
         }
     }
+}
+
+/// Puts back the bits of a block of elements of `width` bytes, which Blosc 1 wrote bit by bit: the lowest bits of all first bytes, then their second bits,
+/// and so on. A block whose elements are no multiple of eight is as it was.
+fn unshuffle_bits(block: &mut [u8], width: usize) {
+    let count = block.len() / width;
+    if !count.is_multiple_of(8) {
+        return;
+    }
+    let row = count / 8;
+    let mut out = block.to_vec();
+    out[..count * width].fill(0);
+    for (at, &bits) in block[..count * width].iter().enumerate() {
+        let (byte, bit, eighth) = (at / row / 8, at / row % 8, at % row);
+        for element in 0..8 {
+            out[(8 * eighth + element) * width + byte] |= (bits >> element & 1) << bit;
+        }
+    }
+    block.copy_from_slice(&out);
 }
 
 fn within(bytes: u64, most: u64) -> Result<(), String> {
@@ -141,6 +173,35 @@ mod tests {
         let shuffled = (0..4).flat_map(|byte| what().into_iter().skip(byte).step_by(4)).collect();
         assert_eq!(unpack(&[Step::Shuffle(4)], shuffled, 384), Ok(what()));
     }
+
+    /// By numcodecs 0.16, `Blosc(shuffle=BITSHUFFLE)` of 7 i % 100: 1001 numbers of one byte with lz4, 80 of two bytes with zstd, 243 of two bytes with lz4. A block
+    /// of the first and the last is no multiple of eight.
+    #[test]
+    fn bits_that_numcodecs_shuffled_are_put_back() {
+        let hex = |text: &str| (0..text.len()).step_by(2).map(|i| u8::from_str_radix(&text[i..i + 2], 16).unwrap()).collect::<Vec<u8>>();
+        for (count, width, text) in BITSHUFFLED {
+            let expected: Vec<u8> = (0..count).flat_map(|i| ((i * 7 % 100) as u16).to_le_bytes()[..width].to_vec()).collect();
+            assert_eq!(unpack(&[Step::Blosc], hex(text), expected.len() as u64), Ok(expected), "{count} of {width}");
+        }
+    }
+
+    const BITSHUFFLED: [(usize, usize, &str); 3] = [
+        (
+            1001,
+            1,
+            "02012401e9030000e90300008a0000001400000072000000ff5500070e151c232a31383f464d545b62050c131a21282f363d444b525960030a11181f262d343b424950575e01080f161d242b323940474e555c63060d141b222930373e454c535a61040b121920272e353c434a51585f020910171e252c333a41484f565d6400ffffff7050484f565d00",
+        ),
+        (
+            80,
+            2,
+            "02019402a0000000a000000060000000140000004800000028b52ffd20a0fd01005403aaaa661e9ee1011ee6e11d1ee1542bb54aabb44aa9544a9833c68c33c78c31678ce043f8103c000fc287f0007c001fc007f003f80003100072130a23da",
+        ),
+        (
+            243,
+            2,
+            "02012402e6010000e6010000c201000014000000d3000000ffb9000007000e0015001c0023002a00310038003f0046004d0054005b00620005000c0013001a00210028002f0036003d0044004b0052005900600003000a00110018001f0026002d0034003b0042004900500057005e00010008000f0016001d0024002b0032003900400047004e0055005c00630006000d0014001b0022002900300037003e0045004c0053005a00610004000b0012001900200027002e0035003c0043004a00510058005f0002000900100017001e0025002c0033003a00410048004f0056005d00c8001350210028002fd3000000ffb90036003d0044004b0052005900600003000a00110018001f0026002d0034003b0042004900500057005e00010008000f0016001d0024002b0032003900400047004e0055005c00630006000d0014001b0022002900300037003e0045004c0053005a00610004000b0012001900200027002e0035003c0043004a00510058005f0002000900100017001e0025002c0033003a00410048004f0056005d00000007000e0015001c0023002a00310038003f0046004d0054005b00620005000c0013001a00210028002fc80013500057005e00",
+        ),
+    ];
 
     #[test]
     fn other_lengths_and_damage_are_refused() {
