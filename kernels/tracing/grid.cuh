@@ -58,6 +58,9 @@ template <class R> struct Place {
     R fraction, slope;
 };
 
+// See axis_map.rs.
+template <class R> constexpr R EDGE = R(1) / R(1024);
+
 // Finds the cell, which is in range for every state, NaN included.
 template <bool EVEN, bool WRAP, class R> RW_FN Place<R> locate(const AxisData<R>& axis, R state) {
     Place<R> place;
@@ -67,7 +70,8 @@ template <bool EVEN, bool WRAP, class R> RW_FN Place<R> locate(const AxisData<R>
         held = state - axis.wrap * floor_(state / axis.wrap);
     } else {
         held = min_(max_(state, R(0)), axis.high);
-        place.slope = held == state ? R(1) : R(0);
+        const R beyond = held - state;
+        place.slope = max_(beyond, -beyond) <= EDGE<R> ? R(1) : R(0);
     }
     if (EVEN) {
         // NaN is clamped to 0 above; on an axis that wraps, it converts to 0 or is clamped here.

@@ -57,6 +57,10 @@ pub struct GridLocation<L: Gather> {
     pub scaled: bool,
 }
 
+/// Distance beyond the end of an axis, in cell lengths, up to which the velocity still has the slope of the last cell: what rounding moves a point that
+/// lies on the edge. The slope would be 0 there, and the FTLE of the edge with it.
+const EDGE: f64 = 1.0 / 1024.0;
+
 impl<R: Real> AxisMap<R> {
     /// Prepares an axis for particles with a boundary policy.
     pub fn new(axis: &Axis, boundary: Boundary) -> Self {
@@ -113,7 +117,8 @@ impl<R: Real> AxisMap<R> {
             held = state - wrap * (state / wrap).floor();
         } else {
             held = held.max(L::zero()).min(L::splat(self.high));
-            let same = held.equal(state);
+            let edge = L::splat(R::from_f64(EDGE));
+            let same = (held - state).abs().max(edge).equal(edge);
             if !same.all() {
                 slope = L::select(same, slope, L::zero());
                 scaled = true;
@@ -180,6 +185,7 @@ mod tests {
             assert!((location.fraction - fraction).abs() < 1e-13, "{coordinate}");
         }
         assert_eq!(map.locate(-3.0).slope, 0.0);
+        assert!(map.locate(-1e-7).slope > 0.0 && map.locate(4.0 + 1e-7).slope > 0.0, "rounding leaves a point on the edge");
         assert!(map.locate(f64::NAN).cell <= 3);
     }
 
