@@ -5,12 +5,15 @@
 use super::audit::{AuditFindings, AuditRequest, audit};
 use super::interruptible::Interruptible;
 use super::router::QueryRouter;
-use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
+use super::{
+    Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, StartsAnew, Surrogate, SurrogateRequest,
+    TracedBricks,
+};
 use rayon::prelude::*;
 use ridgewatch_base::progress;
 use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement};
+use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement, own_nodes};
 use ridgewatch_render::{Film, RenderStats, Renderer};
 use ridgewatch_source::Listener;
 use ridgewatch_surrogate::{
@@ -97,28 +100,83 @@ impl<'a> HostFrame<'a> {
 pub struct HostPicture {
     nodes: Option<Nodes>,
     picture: Picture,
+    /// Bricks that were traced instead, and the values of their own nodes, one after the other.
+    traced: TracedBricks,
+    traced_values: Vec<f32>,
+}
+
+impl StartsAnew for HostPicture {
+    fn start_anew(&mut self) {
+        (self.nodes, self.picture) = (None, Picture::default());
+    }
 }
 
 impl HostPicture {
-    /// Lays the surrogate out on nodes, once. `None` if `stop` ended it early.
-    fn nodes(&mut self, surrogate: &dyn Predict, shape: [usize; 3], stop: &AtomicBool) -> Result<Option<Nodes>, DeviceError> {
+    /// Lays the surrogate out on nodes, once: predicted where it is trusted, and traced elsewhere as far as `smooth` allows. `None` if `stop` ended it early.
+    fn nodes(
+        &mut self,
+        frame: &HostFrame<'_>,
+        smooth: Smooth,
+        renderer: &Renderer,
+        router: &mut QueryRouter<'_>,
+    ) -> Result<Option<Nodes>, DeviceError> {
         /// Nodes that are predicted at once, which bounds the memory beside the nodes.
         const AT_ONCE: usize = 1 << 20;
+        /// Bricks that are traced at once: some tens of thousands of nodes.
+        const BRICKS_AT_ONCE: usize = 128;
         if let Some(nodes) = &self.nodes {
             return Ok(Some(nodes.clone()));
         }
+        let shape = smooth.nodes;
+        let surrogate = frame.surrogate.ok_or_else(|| DeviceError::Unsupported { what: "a smooth frame without a surrogate".into() })?;
+        let is_stopped = || {
+            progress::mark();
+            frame.stop.load(Ordering::Relaxed)
+        };
         let mut values = vec![0.0; shape.iter().product()];
         for (part, values) in values.chunks_mut(AT_ONCE).enumerate() {
-            if stop.load(Ordering::Relaxed) {
+            if is_stopped() {
                 return Ok(None);
             }
-            progress::mark();
             let first = part * AT_ONCE;
             let points: Vec<UnitPoint> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;
         }
-        Ok(Some(self.nodes.insert(Nodes::new(shape, Arc::new(values))).clone()))
+        let mut nodes = Nodes::new(shape, Arc::new(values));
+        if smooth.traced_nodes > 0 {
+            if self.traced.settle(shape) {
+                self.traced_values.clear();
+            }
+            let next = self.traced.next(nodes.brick_max(), frame.routing.gate, |s| renderer.ramp(s), smooth.traced_nodes);
+            let domain = frame.tracer.flow().domain();
+            for bricks in next.chunks(BRICKS_AT_ONCE) {
+                let points: Vec<DomainPoint> = indices(shape, bricks).map(|i| domain.from_unit(Nodes::unit(shape, i))).collect();
+                let mut found = vec![0.0; points.len()];
+                router.trace_nodes(&points, &mut found)?;
+                if is_stopped() {
+                    return Ok(None);
+                }
+                // As in a table, whose interpolation a NaN would spread.
+                self.traced_values.extend(found.into_iter().map(|value| if value.is_finite() { value } else { 0.0 }));
+                self.traced.add(bricks);
+            }
+            let mut values = nodes.into_values();
+            indices(shape, self.traced.bricks()).zip(&self.traced_values).for_each(|(node, &value)| values[node] = value);
+            nodes = Nodes::new(shape, Arc::new(values));
+        }
+        Ok(Some(self.nodes.insert(nodes).clone()))
     }
+}
+
+/// Own nodes of bricks, one after the other.
+fn indices(shape: [usize; 3], bricks: &[u32]) -> impl Iterator<Item = usize> {
+    bricks.iter().flat_map(move |&brick| {
+        let [x, y, z] = own_nodes(shape, brick as usize);
+        z.flat_map(move |z| {
+            let x = x.clone();
+            y.clone().flat_map(move |y| x.clone().map(move |x| (z * shape[1] + y) * shape[0] + x))
+        })
+    })
 }
 
 /// Renders a smooth frame on the CPU.
@@ -128,14 +186,13 @@ fn refine_on_cpu(
     renderer: &mut Renderer,
     picture: &mut HostPicture,
 ) -> Result<Rendered<Samples>, DeviceError> {
-    let missing_surrogate = || DeviceError::Unsupported { what: "a smooth frame without a surrogate".into() };
-    let nodes = picture.nodes(frame.surrogate.ok_or_else(missing_surrogate)?, smooth.nodes, frame.stop)?;
     let flow = frame.tracer.flow();
     let is_missing = |point: DomainPoint| flow.is_missing(point);
     let nothing_trusted = Gate::uniform(false);
     let routing = Routing { gate: &nothing_trusted, trace_budget: None, ..frame.routing };
     let tracer = Interruptible::new(frame.tracer, frame.stop);
     let mut router = QueryRouter::new(&tracer, None, routing);
+    let nodes = picture.nodes(frame, smooth, renderer, &mut router)?;
     let round = |nodes| Refinement {
         nodes,
         missing: flow.has_missing().then_some(&is_missing),

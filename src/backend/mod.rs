@@ -4,6 +4,7 @@
 //! If a device fails, the call returns [`DeviceError`]. `run` then discards the frame and computes it again on the CPU.
 
 pub mod audit;
+mod bricks;
 mod cpu;
 #[cfg(feature = "cuda")]
 pub mod cuda;
@@ -14,6 +15,7 @@ mod router;
 mod settings;
 
 pub use audit::{Audit, AuditFindings, AuditRequest, residuals, stratified_points, trusted_error};
+pub use bricks::TracedBricks;
 pub use cpu::{Cpu, HostFrame, HostPicture, render_on_cpu};
 #[cfg(feature = "cuda")]
 pub use device::CudaDevice;
@@ -46,8 +48,8 @@ pub trait Backend: Send + Sync + Sized {
     type Surrogate: Surrogate<Tracer = Self::Tracer>;
     /// Labels that a frame traced. They take effect when they are committed.
     type Samples: FrameSamples;
-    /// Picture that accumulates over frames. The default value has no samples.
-    type Picture: Default + Send;
+    /// Picture that accumulates over frames. The default value has no samples; each window has its own.
+    type Picture: Default + Send + StartsAnew;
 
     /// Device name in the records, for example `cuda:0 NVIDIA H200`.
     fn name(&self) -> String;
@@ -225,6 +227,8 @@ pub struct Smooth {
     pub sum: bool,
     /// Nodes along x, y, z on which a surrogate without a table is laid out.
     pub nodes: [usize; 3],
+    /// Most of these nodes that are traced when a picture starts, where the gate does not trust the surrogate.
+    pub traced_nodes: usize,
 }
 
 /// A rendered frame.
@@ -239,6 +243,12 @@ pub struct Rendered<S> {
     pub samples: S,
     /// Stated error of a smooth frame.
     pub error: Option<PictureError>,
+}
+
+/// A picture that shows another surrogate of the same window.
+pub trait StartsAnew {
+    /// Forgets all samples and the surrogate, but not the nodes that were traced.
+    fn start_anew(&mut self);
 }
 
 /// Labels of one frame. If they are dropped without [`FrameSamples::commit`], they are removed from the device as well.

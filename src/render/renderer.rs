@@ -125,6 +125,11 @@ impl Renderer {
         &self.transfer
     }
 
+    /// Optical ramp of a log-stretch under the current transfer function: 0 where nothing is shown.
+    pub fn ramp(&self, log_stretch: f32) -> f32 {
+        self.transfer.ramp(log_stretch * self.inverse_tau)
+    }
+
     /// The current majorants.
     pub fn majorants(&self) -> &MajorantGrid {
         &self.majorants

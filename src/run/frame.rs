@@ -10,7 +10,7 @@ use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
-use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, Surrogate};
+use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, StartsAnew, Surrogate};
 use crate::field::Domain;
 use crate::flow::VelocitySource;
 use crate::progress;
@@ -167,7 +167,7 @@ impl Run<'_> {
         // A picture shows the surrogate as it was when the picture started. It starts anew whenever the training has doubled.
         let steps = self.report.train_steps + self.learning.unreported.steps;
         if is_smooth && learns && steps >= 2 * self.progress.steps_shown.max(1) {
-            *accumulated = B::Picture::default();
+            accumulated.start_anew();
             self.progress.steps_shown = steps;
         }
         let tracer = present(tracer);
@@ -189,7 +189,12 @@ impl Run<'_> {
                     Some(nodes) => nodes,
                     None => set().map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?,
                 };
-                Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes })
+                // As many as take as long as the samples. A surrogate with a table is as good as that where it is not trusted.
+                let a_sample = backend.nodes_per_sample()[1] * self.render.width * self.render.height;
+                let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
+                let has_table = surrogate.as_ref().and_then(Surrogate::table_nodes).is_some();
+                let traced_nodes = if learns && !has_table { (a_sample as f64 * samples) as usize } else { 0 };
+                Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes, traced_nodes })
             }
             _ => None,
         };
@@ -369,7 +374,7 @@ impl Run<'_> {
             integration_steps: fixed_steps(flow).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
             integration_residual: self.report.integration_residual,
-            preparation_traces: std::mem::take(&mut self.progress.preparation_traces),
+            preparation_traces: std::mem::take(&mut self.progress.preparation_traces) + tally.nodes,
             audited: work.audit.points as u64,
             mean_lifetime_share: work.audit.mean_lifetime_share,
             majorant_exceeded: work.rendered.stats.majorant_exceeded,

@@ -246,6 +246,23 @@ impl Gate {
         self.trusted[cell_of(self.shape, point)]
     }
 
+    /// A gate of `shape` cells along x, y and z, `trusted` with x fastest.
+    ///
+    /// # Panics
+    /// If the number of cells differs.
+    pub fn of(shape: [usize; 3], trusted: Vec<bool>) -> Self {
+        assert_eq!(trusted.len(), shape.iter().product::<usize>(), "one entry a cell");
+        Self { shape, trusted }
+    }
+
+    /// True if the surrogate answers everywhere between two corners, the lower one first.
+    pub fn trusts_box(&self, corners: [UnitPoint; 2]) -> bool {
+        let [low, high] = corners.map(|corner| cell_of(self.shape, corner));
+        let [nx, ny, nz] = self.shape;
+        let range = |stride: usize, n: usize| low / stride % n..=high / stride % n;
+        range(nx * ny, nz).all(|z| range(nx, ny).all(|y| range(1, nx).all(|x| self.trusted[(z * ny + y) * nx + x])))
+    }
+
     /// Cells along x, y and z.
     pub fn shape(&self) -> [usize; 3] {
         self.shape

@@ -8,7 +8,7 @@ use super::window::SnapshotStore;
 use crate::cpu::{HostFrame, HostPicture, render_on_cpu};
 use crate::{
     AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
-    Rendered, Surrogate, SurrogateRequest, WhenLost, audit,
+    Rendered, StartsAnew, Surrogate, SurrogateRequest, WhenLost, audit,
 };
 use ridgewatch_field::UnitPoint;
 use ridgewatch_flow::{FlowMap, VelocitySource};
@@ -34,13 +34,20 @@ const NODES_PER_SAMPLE: [usize; 2] = [64, 8];
 pub struct CudaPicture {
     /// Accumulates where the placement puts frames on the CPU.
     host: HostPicture,
-    /// Number of the picture that the GPU accumulates.
-    number: u64,
+    /// Number of the window, and of its picture that the GPU accumulates.
+    numbers: [u64; 2],
+}
+
+impl StartsAnew for CudaPicture {
+    fn start_anew(&mut self) {
+        self.host.start_anew();
+        self.numbers[1] = fresh_stamp();
+    }
 }
 
 impl Default for CudaPicture {
     fn default() -> Self {
-        Self { host: HostPicture::default(), number: fresh_stamp() }
+        Self { host: HostPicture::default(), numbers: [fresh_stamp(), fresh_stamp()] }
     }
 }
 
@@ -164,7 +171,7 @@ impl Backend for Cuda {
         if self.placement.frames == Place::Host || job.routing.extras.jacobian {
             return self.render_on_cpu(job, renderer, &mut picture.host);
         }
-        self.frames()?.render(job, resident, renderer, picture.number)
+        self.frames()?.render(job, resident, renderer, picture.numbers)
     }
 
     fn audit(

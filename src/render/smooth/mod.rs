@@ -24,7 +24,7 @@ pub use coupled::{CoupledPath, coupled_paths};
 pub use light_volume::{LightGrid, LightVolume, MARGIN};
 pub use march::{RaySum, ToLight};
 pub use medium::{IsMissing, Medium, node_spacing};
-pub use nodes::{BRICK, Nodes};
+pub use nodes::{BRICK, Nodes, brick_shape, own_nodes};
 pub use picture::{Picture, Refinement};
 pub use regression::Guides;
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};

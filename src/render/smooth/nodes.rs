@@ -3,6 +3,7 @@
 use crate::Transfer;
 use rayon::prelude::*;
 use ridgewatch_field::UnitPoint;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Cells along the edge of a brick.
@@ -18,6 +19,18 @@ pub struct Nodes {
     brick_max: Vec<f32>,
 }
 
+/// Bricks along x, y, z of a grid with `shape` nodes.
+pub fn brick_shape(shape: [usize; 3]) -> [usize; 3] {
+    shape.map(|n| (n - 1).div_ceil(BRICK).max(1))
+}
+
+/// Nodes along x, y, z that belong to a brick alone: without its upper faces, unless the grid ends there.
+pub fn own_nodes(shape: [usize; 3], brick: usize) -> [Range<usize>; 3] {
+    let bricks = brick_shape(shape);
+    let index = [brick % bricks[0], brick / bricks[0] % bricks[1], brick / (bricks[0] * bricks[1])];
+    [0, 1, 2].map(|k| index[k] * BRICK..if index[k] + 1 == bricks[k] { shape[k] } else { (index[k] + 1) * BRICK })
+}
+
 impl Nodes {
     /// Takes the values of a grid with `shape` nodes along x, y, z.
     ///
@@ -26,7 +39,7 @@ impl Nodes {
     pub fn new(shape: [usize; 3], values: Arc<Vec<f32>>) -> Self {
         assert_eq!(values.len(), shape.iter().product::<usize>(), "one value a node");
         assert!(shape[0] > 1 && shape[1] > 1 && shape[2] > 0, "{shape:?}");
-        let brick_shape = shape.map(|n| (n - 1).div_ceil(BRICK).max(1));
+        let brick_shape = brick_shape(shape);
         let largest = |brick: usize| {
             let index = [brick % brick_shape[0], brick / brick_shape[0] % brick_shape[1], brick / (brick_shape[0] * brick_shape[1])];
             let range = |k: usize| index[k] * BRICK..((index[k] + 1) * BRICK + 1).min(shape[k]);
@@ -40,6 +53,11 @@ impl Nodes {
         let bricks = brick_shape.iter().product();
         let brick_max = (0..bricks).into_par_iter().with_min_len(64).map(largest).collect();
         Self { shape, values, brick_shape, brick_max }
+    }
+
+    /// Gives up the values, x fastest.
+    pub fn into_values(self) -> Vec<f32> {
+        Arc::unwrap_or_clone(self.values)
     }
 
     /// Nodes along x, y, z.

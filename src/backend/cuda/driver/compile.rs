@@ -23,6 +23,7 @@ pub const SOURCES: &[(&str, &str)] = kernel_files![
     "network/network_fused.cu",
     "rendering/answer.cu",
     "rendering/audit.cu",
+    "rendering/bricks.cu",
     "rendering/coupled.cu",
     "rendering/combine.cu",
     "rendering/march.cu",

@@ -72,7 +72,7 @@ impl GpuFrames {
         })
     }
 
-    /// Renders a frame. Every query is traced if `surrogate` is `None`. A smooth frame refines the picture with the number `picture`.
+    /// Renders a frame. Every query is traced if `surrogate` is `None`. A smooth frame refines the picture of these numbers of the window and itself.
     ///
     /// # Errors
     /// The device fails or lacks memory, or the renderer rejects the number of samples.
@@ -81,7 +81,7 @@ impl GpuFrames {
         job: &FrameJob<'_, B>,
         surrogate: Option<&FrozenHybrid<OnGpu>>,
         renderer: &mut Renderer,
-        picture: u64,
+        [window, picture]: [u64; 2],
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let (tracer, routing) = (job.tracer, job.routing);
         let progress = job.progress.map(|report| report as &dyn Fn(f32));
@@ -96,7 +96,7 @@ impl GpuFrames {
         }
         let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
         if let (Some(smooth), Some(frozen), Some(predictor)) = (job.smooth, surrogate, &predictor) {
-            return self.refine(job, smooth, frozen, predictor, renderer, picture);
+            return self.refine(job, smooth, frozen, predictor, renderer, [window, picture]);
         }
         let pool = surrogate.and_then(|frozen| frozen.network.as_ref()?.pool().cloned());
         let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
@@ -130,7 +130,7 @@ impl GpuFrames {
         frozen: &FrozenHybrid<OnGpu>,
         predictor: &Predictor<'_>,
         renderer: &mut Renderer,
-        picture: u64,
+        [window, picture]: [u64; 2],
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let (tracer, routing) = (job.tracer, job.routing);
         let own = match self.smooth.take() {
@@ -142,7 +142,8 @@ impl GpuFrames {
             Predictor::Table(table) => Some(*table),
             Predictor::Network(..) => None,
         };
-        let round = SmoothRound { smooth, picture, frame: job.picture, samples: job.samples, tracer, table, predictor, stop: job.stop };
+        let (frame, samples, gate, stop) = (job.picture, job.samples, routing.gate, job.stop);
+        let round = SmoothRound { smooth, picture, window, gate, frame, samples, tracer, table, predictor, stop };
         let pool = frozen.network.as_ref().and_then(|network| network.pool().cloned());
         let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
         let nothing_trusted = Gate::uniform(false);
@@ -174,7 +175,14 @@ impl GpuFrames {
             let (film, stats) = (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() });
             return Ok(Rendered { film, stats, tally: Tally::default(), samples: labels, error: None });
         };
-        let tally = Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
+        let tally = Tally {
+            queries: stats.queries,
+            traced: stats.traced,
+            missing: stats.missing,
+            nodes: own.traced_nodes(),
+            trace_seconds,
+            ..Tally::default()
+        };
         Ok(Rendered { film, stats, tally, samples: labels, error: Some(error).filter(PictureError::is_known) })
     }
 

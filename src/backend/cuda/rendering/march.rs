@@ -12,7 +12,7 @@ use crate::cuda::layout::{MissingCellsArgument, TableArgument, device_repr};
 use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTable, Gpu, launch, threads};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaFunction, DeviceRepr, LaunchConfig, PushKernelArg};
-use ridgewatch_render::smooth::{BRICK, LightGrid, MARGIN};
+use ridgewatch_render::smooth::{LightGrid, MARGIN, brick_shape};
 use ridgewatch_render::{FrameParameters, Renderer};
 use std::marker::PhantomData;
 use std::sync::Arc;
@@ -163,6 +163,13 @@ pub struct NodeGrid<'a> {
     _memory: PhantomData<&'a ()>,
 }
 
+impl BricksArgument {
+    /// Bricks of nodes, with room for a value of each at `highest`; `usable` as in `march.cuh`.
+    pub(super) fn of(nodes: NodeGrid<'_>, highest: u64, usable: bool) -> Self {
+        Self { highest, count: brick_shape(nodes.shape()).map(|n| n as i32), usable: i32::from(usable) }
+    }
+}
+
 impl NodeGrid<'_> {
     /// Nodes along x, y, z; one along z for a two-dimensional flow.
     pub fn shape(&self) -> [usize; 3] {
@@ -172,10 +179,6 @@ impl NodeGrid<'_> {
     /// Kernel argument, the struct `Table` of `table.cuh`.
     pub(in crate::cuda) fn argument(&self) -> TableArgument {
         self.argument
-    }
-
-    fn bricks(&self) -> [usize; 3] {
-        self.shape().map(|n| (n - 1).div_ceil(BRICK).max(1))
     }
 }
 
@@ -250,7 +253,7 @@ impl DeviceNodes {
 }
 
 /// Macros of `march.cu`.
-fn variant(holes: bool, point_light: bool) -> Vec<String> {
+pub(super) fn variant(holes: bool, point_light: bool) -> Vec<String> {
     vec![format!("RW_HOLES={}", u8::from(holes)), format!("RW_POINT_LIGHT={}", u8::from(point_light))]
 }
 
@@ -332,10 +335,9 @@ impl GpuMarch {
         if self.kernels.variant != variant {
             self.kernels = Kernels::new(&gpu, variant[0], variant[1])?;
         }
-        let count = medium.nodes.bricks();
-        let bricks = count.iter().product::<usize>();
+        let bricks = brick_shape(medium.nodes.shape()).iter().product::<usize>();
         let highest = room(&gpu, &mut self.highest, "bricks of nodes", bricks)?.address();
-        let bricks_argument = BricksArgument { highest, count: count.map(|n| n as i32), usable: i32::from(medium.missing_cells.is_none()) };
+        let bricks_argument = BricksArgument::of(medium.nodes, highest, medium.missing_cells.is_none());
         let depth = room(&gpu, &mut self.depth, "the light volume", grid.values())?.address();
         let light = LightArgument::new(&grid, depth);
         let stream = gpu.work();

@@ -1,6 +1,7 @@
 //! Frames on the GPU: wavefront path tracing, query routing, labels and audits.
 
 mod audit;
+mod bricks;
 mod combine;
 mod coupled;
 mod frames;

@@ -1,6 +1,7 @@
 //! Smooth frames on the GPU: marches the surrogate, tracks pairs of coupled paths where the variance is, combines both, and states the error of the
 //! result. The algorithm and its reference are in [`ridgewatch_render::smooth`]; how finely to march and where to sample is decided there as well.
 
+use super::bricks::{DeviceBricks, Wanted};
 use super::combine::{CombineInput, FilmPlanes, GpuCombine};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
@@ -16,6 +17,7 @@ use ridgewatch_render::smooth::{
     NET, PAIR, PictureError, TileSums, ToneMap,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
+use ridgewatch_trust::Gate;
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,6 +36,9 @@ pub(in crate::cuda) struct GpuSmooth {
     gpu: Arc<Gpu>,
     march: GpuMarch,
     nodes: DeviceNodes,
+    /// Nodes of a network that were traced, since it was not trusted there, and how many of them in this frame.
+    bricks: DeviceBricks,
+    traced_nodes: u64,
     tracker: CoupledTracker,
     combine: GpuCombine,
     sums: Option<Buffer<f32>>,
@@ -51,6 +56,10 @@ pub(super) struct SmoothRound<'a> {
     pub(super) smooth: Smooth,
     /// Number of the picture; another number starts anew.
     pub(super) picture: u64,
+    /// Number of its window; another one has no traced nodes.
+    pub(super) window: u64,
+    /// Cells in which the surrogate is trusted.
+    pub(super) gate: &'a Gate,
     /// Number of the frame.
     pub(super) frame: u64,
     /// Coupled samples per pixel.
@@ -78,6 +87,8 @@ impl GpuSmooth {
         Ok(Self {
             march: GpuMarch::new(gpu)?,
             nodes: DeviceNodes::new(gpu)?,
+            bricks: DeviceBricks::new(gpu)?,
+            traced_nodes: 0,
             tracker: CoupledTracker::new(gpu)?,
             combine: GpuCombine::new(gpu)?,
             gpu: gpu.clone(),
@@ -90,8 +101,14 @@ impl GpuSmooth {
         })
     }
 
+    /// Nodes of a network that were traced in the latest round, since it was not trusted there.
+    pub(super) fn traced_nodes(&self) -> u64 {
+        self.traced_nodes
+    }
+
     /// Starts anew if the round shows anything else than the picture so far.
-    fn settle(&mut self, round: &SmoothRound<'_>, renderer: &mut Renderer) -> Result<(), DeviceError> {
+    fn settle(&mut self, round: &SmoothRound<'_>, renderer: &mut Renderer, answers: &mut dyn DeviceLogStretch) -> Result<(), DeviceError> {
+        self.traced_nodes = 0;
         let scene = renderer.scene();
         if self.shows.as_ref().is_some_and(|(picture, shown)| *picture == round.picture && shown == scene) {
             return Ok(());
@@ -99,7 +116,12 @@ impl GpuSmooth {
         self.shows = None;
         let (width, height) = (scene.settings.width, scene.settings.height);
         if round.table.is_none() {
-            self.nodes.lay_out(round.predictor, round.smooth.nodes, round.tracer.host().domain().dimensions)?;
+            let domain = round.tracer.host().domain();
+            self.nodes.lay_out(round.predictor, round.smooth.nodes, domain.dimensions)?;
+            if round.smooth.traced_nodes > 0 {
+                let wanted = Wanted { window: round.window, domain, gate: round.gate, most: round.smooth.traced_nodes };
+                self.traced_nodes = self.bricks.fill(node_grid(&self.nodes, round)?, renderer, &wanted, answers)?;
+            }
         }
         let planes = SUM_PLANES * width * height;
         match &mut self.sums {
@@ -136,7 +158,7 @@ impl GpuSmooth {
         renderer: &mut Renderer,
         answers: &mut dyn DeviceLogStretch,
     ) -> Result<Option<(Film, RenderStats, PictureError)>, DeviceError> {
-        self.settle(round, renderer)?;
+        self.settle(round, renderer, answers)?;
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
         let mut stats = self.track(round, renderer, answers)?;
