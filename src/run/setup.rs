@@ -119,7 +119,12 @@ impl Setup {
                     .ok_or_else(|| Refused::new("time.tau", format_args!("is {}", shown(tau)), "a number, or words such as \"30 days\""))?
             }
             (None, Some(_)) if archive && scene.archive.steady => {
-                return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
+                return Err(Refused::new(
+                    "time.tau",
+                    "is missing",
+                    "a duration, since a steady flow gives none: --set time.tau=\"5 days\" (archive.steady is true)",
+                )
+                .into());
             }
             // Chosen below, at most this.
             (None, Some(source)) => source.longest_default_tau()?,

@@ -6,9 +6,11 @@ use ridgewatch_field::{Axis, Geometry, Grid};
 const POLE: f64 = 1e-6;
 
 /// Vertical velocity at the nodes of a grid whose levels are metres, upwards, m/s: w(z) is minus the integral of du/dx + dv/dy from the lowest node of the column
-/// that is known, where w is 0, up to z. Differences are of second order, integration by trapezoids. u and v at missing nodes beside known ones count as 0: nothing
+/// that is known, where w is 0, up to z; in the air, whose density falls as exp(-z / H), each part of the integral grows by its share of the density. Differences are of second order, integration by trapezoids. u and v at missing nodes beside known ones count as 0: nothing
 /// flows into land.
-pub fn vertical_velocity(grid: &Grid, u: &[f32], v: &[f32]) -> Vec<f32> {
+///
+/// `scale_height`: H in the grid's metres; `None` in water.
+pub fn vertical_velocity(grid: &Grid, u: &[f32], v: &[f32], scale_height: Option<f64>) -> Vec<f32> {
     let [nx, ny, nz] = grid.shape();
     let (x, y, z) = (&grid.axes[0], &grid.axes[1], grid.axes[2].coordinates());
     let on_sphere = |value: f64| match grid.geometry {
@@ -37,7 +39,14 @@ pub fn vertical_velocity(grid: &Grid, u: &[f32], v: &[f32]) -> Vec<f32> {
             for k in 0..nz {
                 let here = divergence(i, j, k);
                 if !here.is_nan() {
-                    sum = if below.is_nan() { 0.0 } else { sum - 0.5 * (below + here) * (z[k] - z[k - 1]) };
+                    sum = match below.is_nan() {
+                        true => 0.0,
+                        false => {
+                            let step = z[k] - z[k - 1];
+                            let thinner = scale_height.map_or(1.0, |height| (step / height).exp());
+                            thinner * sum - 0.5 * (thinner * below + here) * step
+                        }
+                    };
                     w[(k * ny + j) * nx + i] = sum as f32;
                 }
                 below = here;
@@ -103,12 +112,25 @@ mod tests {
         let (mut u, v) = (on(&grid, |[x, ..]| 1e-4 * x), on(&grid, |[_, y, _]| 2e-4 * y));
         let expected = on(&grid, |[.., z]| -3e-4 * (z + 30.0));
         let apart = |w: &[f32]| w.iter().zip(&expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        let found = vertical_velocity(&grid, &u, &v);
+        let found = vertical_velocity(&grid, &u, &v, None);
         assert!(apart(&found) < 1e-8, "{found:?}");
         // A column whose lowest node is rock begins above it.
         u[4] = f32::NAN;
-        let found = vertical_velocity(&grid, &u, &v);
+        let found = vertical_velocity(&grid, &u, &v, None);
         assert!(found[4].is_nan() && found[12 + 4] == 0.0 && found[24 + 4] < 0.0, "{found:?}");
+    }
+
+    #[test]
+    fn air_that_spreads_sinks_faster_where_it_is_thinner() {
+        let heights: Vec<f64> = (0..81).map(|k| 200.0 * f64::from(k)).collect();
+        let axis = |name: &str, values: &[f64]| Axis::new(name, "m", values.to_vec()).unwrap();
+        let grid = grid([axis("x", &[0.0, 1e4]), axis("y", &[0.0, 1e4]), axis("z", &heights)], Geometry::Cartesian);
+        let (u, v) = (on(&grid, |[x, ..]| 1e-5 * x), on(&grid, |_| 0.0));
+        let found = vertical_velocity(&grid, &u, &v, Some(7000.0));
+        // The integral of exp((z - z') / H) D over z' from 0 to z.
+        let expected = on(&grid, |[.., z]| -1e-5 * 7000.0 * ((z / 7000.0).exp() - 1.0));
+        // Trapezoids of 200 m: (200 / 7000)^2 / 12 of the integral.
+        assert!(found.iter().zip(&expected).all(|(a, b)| (a - b).abs() <= 7e-5 * b.abs() + 1e-9), "{:?}", &found[found.len() - 4..]);
     }
 
     #[test]
@@ -127,7 +149,7 @@ mod tests {
             let (x, y) = (x.to_radians(), y.to_radians());
             -(z + 10.0) * (seen * x.cos() + (2.0 * y).cos() - y.sin().powi(2)) / radius
         });
-        let found = vertical_velocity(&grid, &u, &v);
+        let found = vertical_velocity(&grid, &u, &v, None);
         for (node, (a, b)) in found.iter().zip(&expected).enumerate() {
             let row = node / 36 % 181;
             // Beside a pole its cosine is small, and the error of differences counts.

@@ -7,8 +7,12 @@ use crate::error::SourceError;
 use crate::formats::DataFile;
 use crate::georeference::{Positions, mapping, unit_of_plane};
 use crate::grids::Layout;
-use crate::projection::{Jacobian, Projection, turned};
+use crate::projection::{Jacobian, Projection, difference, turned};
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
+use ridgewatch_field::EARTH_RADIUS;
+
+/// Smallest spacing over which longitudes and latitudes of single precision, a metre apart, tell a scale to a thousandth; metres.
+const LEAST_MEASURED: f64 = 500.0;
 
 /// Turns velocities over the ground to the x and y of a grid, and stretches them to its metres.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,8 +50,12 @@ impl GroundToGrid {
         let projection = Self::projection(file, layout, is_plane, known);
         let (xs, ys) = (layout.axes[0].axis.coordinates(), layout.poles.rows_of_file(layout.axes[1].axis.coordinates()));
         let nodes: Vec<[f64; 2]> = ys.iter().flat_map(|&y| xs.iter().map(move |&x| [x, y])).collect();
+        // On finer grids the last digits of longitudes and latitudes would count.
+        let is_measured = is_plane && unit_of_plane(layout).is_some() && (xs[1] - xs[0]).abs().min((ys[1] - ys[0]).abs()) >= LEAST_MEASURED;
+        let is_stretched = is_plane && (projection.is_some() || is_measured);
         let jacobians: Option<Vec<Jacobian>> = match (&projection, known) {
             (Some(projection), _) => some_known(nodes.into_par_iter().map(|place| projection.near(place)).collect()),
+            (None, Some(known)) if is_measured => some_known(measured(&known.degrees, xs, ys)),
             (None, Some(known)) if eastward.is_some() => some_known(rows(&known.degrees, xs.len())),
             (None, _) => None,
         };
@@ -59,7 +67,7 @@ impl GroundToGrid {
             (Some(why), Some(jacobians)) => {
                 let greatest = range(&mut jacobians.iter().map(|[xe, _, ye, _]| ye.atan2(*xe).abs().to_degrees()))[1];
                 let [least, most] = range(&mut jacobians.iter().map(scale));
-                let stretched = match is_plane && projection.is_some() {
+                let stretched = match is_stretched {
                     true => format!(", and stretched to its metres by {least:.4} to {most:.4}"),
                     false => String::new(),
                 };
@@ -69,10 +77,10 @@ impl GroundToGrid {
                 );
                 Ok(Some((Some(Self::new(jacobians.into_iter())), note)))
             }
-            (None, Some(jacobians)) if is_plane && projection.is_some() => {
+            (None, Some(jacobians)) if is_stretched => {
                 let [least, most] = range(&mut jacobians.iter().map(scale));
                 let note = format!(
-                    "velocities run along x and y, and are stretched to the metres of the projection by {least:.4} to {most:.4}; --set \
+                    "velocities run along x and y, and are stretched to the metres of the projection by {by}, by {least:.4} to {most:.4}; --set \
                      archive.grid_relative=false if they run east and north"
                 );
                 let stretches = jacobians.iter().map(|jacobian| {
@@ -81,7 +89,13 @@ impl GroundToGrid {
                 });
                 Ok(Some((Some(Self::new(stretches)), note)))
             }
-            (None, _) => Ok(settings.grid_relative.map(|_| (None, "velocities run along x and y, as set".into()))),
+            (None, _) => {
+                let is_projected = x.is_some_and(|x| x.text("standard_name") == Some("projection_x_coordinate"));
+                let unknown = "a metre along x and y is taken as a metre on the ground: neither a grid mapping that is known nor longitudes and latitudes of its \
+                               points tell the scale of the projection";
+                let set = settings.grid_relative.map(|_| "velocities run along x and y, as set".to_owned());
+                Ok(set.or(is_projected.then(|| unknown.to_owned())).map(|note| (None, note)))
+            }
             (Some(why), None) => {
                 let what = "neither a grid mapping that is known nor longitudes and latitudes of its points tell where east is";
                 if settings.grid_relative.is_some() {
@@ -146,6 +160,31 @@ fn some_known(found: Vec<Jacobian>) -> Option<Vec<Jacobian>> {
     found.iter().any(|jacobian| jacobian[0].is_finite()).then_some(found)
 }
 
+/// Derivatives at nodes with known longitudes and latitudes, by second-order differences along both axes, whose coordinates are metres.
+fn measured(degrees: &[[f64; 2]], xs: &[f64], ys: &[f64]) -> Vec<Jacobian> {
+    let width = xs.len();
+    let along = |here: [f64; 2], n: usize, coordinates: &[f64], place: &dyn Fn(usize) -> [f64; 2]| {
+        let (last, step) = (coordinates.len() - 1, |a: usize, b: usize| coordinates[b] - coordinates[a]);
+        let ends: Vec<(usize, f64)> = match n {
+            _ if last < 2 => vec![(last, 1.0 / step(0, last)), (0, -1.0 / step(0, last))],
+            0 => vec![(1, 4.0 / step(0, 2)), (2, -1.0 / step(0, 2)), (0, -3.0 / step(0, 2))],
+            n if n == last => vec![(n - 1, -4.0 / step(n - 2, n)), (n - 2, 1.0 / step(n - 2, n)), (n, 3.0 / step(n - 2, n))],
+            n => vec![(n + 1, 1.0 / step(n - 1, n + 1)), (n - 1, -1.0 / step(n - 1, n + 1))],
+        };
+        let weighted: Vec<([f64; 2], f64)> = ends.into_iter().map(|(node, weight)| (place(node), weight)).collect();
+        difference(here, &weighted).map(|share| share * EARTH_RADIUS)
+    };
+    let at = |node: usize| {
+        let (i, j, here) = (node % width, node / width, degrees[node]);
+        let [ex, nx] = along(here, i, xs, &|i| degrees[j * width + i]);
+        let [ey, ny] = along(here, j, ys, &|j| degrees[j * width + i]);
+        let determinant = ex * ny - ey * nx;
+        let found = [ny, -ey, -nx, ex].map(|d| d / determinant);
+        if found.iter().all(|d| d.is_finite()) { found } else { [f64::NAN; 4] }
+    };
+    (0..degrees.len()).map(at).collect()
+}
+
 /// Turns at nodes with known longitudes and latitudes, by second-order differences along rows of `width`.
 fn rows(degrees: &[[f64; 2]], width: usize) -> Vec<Jacobian> {
     let turn = |node: usize| {
@@ -157,7 +196,7 @@ fn rows(degrees: &[[f64; 2]], width: usize) -> Vec<Jacobian> {
             column if column + 1 == width => [(at(-1), -4.0), (at(-2), 1.0), (at(0), 3.0)],
             _ => [(at(1), 1.0), (at(-1), -1.0), (at(0), 0.0)],
         };
-        turned(degrees[node], row).unwrap_or([f64::NAN; 4])
+        turned(degrees[node], &row).unwrap_or([f64::NAN; 4])
     };
     (0..degrees.len()).map(turn).collect()
 }

@@ -98,7 +98,7 @@ impl Projection {
             Self::Rotated { .. } => {
                 let ends = [-STEP, STEP].map(|step| self.position([place[0] + step, place[1]]));
                 let [from, to] = [ends[0]?, ends[1]?];
-                turned(self.position(place)?, [(from, -1.0), (to, 1.0)])
+                turned(self.position(place)?, &[(from, -1.0), (to, 1.0)])
             }
             Self::Plane { major, eccentricity, .. } => {
                 let [longitude, latitude] = self.position(place)?;
@@ -118,8 +118,8 @@ impl Projection {
     }
 }
 
-/// Rotation from east and north at `here` to x and y, where `row` are points along x and the weights of their difference.
-pub fn turned<const N: usize>(here: [f64; 2], row: [([f64; 2], f64); N]) -> Option<Jacobian> {
+/// Parts to the east and to the north at `here` of a weighted difference of points, in radii of the globe.
+pub fn difference(here: [f64; 2], points: &[([f64; 2], f64)]) -> [f64; 2] {
     let angles = |place: [f64; 2]| place.map(|angle| angle.to_radians().sin_cos());
     let point = |place: [f64; 2]| {
         let [(sin_lon, cos_lon), (sin_lat, cos_lat)] = angles(place);
@@ -128,9 +128,14 @@ pub fn turned<const N: usize>(here: [f64; 2], row: [([f64; 2], f64); N]) -> Opti
     let [(sin_lon, cos_lon), (sin_lat, cos_lat)] = angles(here);
     let along = |direction: [f64; 3]| {
         let rise = |end: [f64; 2]| point(end).iter().zip(direction).map(|(p, d)| p * d).sum::<f64>();
-        row.iter().map(|&(end, weight)| weight * rise(end)).sum::<f64>()
+        points.iter().map(|&(end, weight)| weight * rise(end)).sum::<f64>()
     };
-    let [east, north] = [along([-sin_lon, cos_lon, 0.0]), along([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])];
+    [along([-sin_lon, cos_lon, 0.0]), along([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])]
+}
+
+/// Rotation from east and north at `here` to x and y, where `row` are points along x and the weights of their difference.
+pub fn turned(here: [f64; 2], row: &[([f64; 2], f64)]) -> Option<Jacobian> {
+    let [east, north] = difference(here, row);
     let length = east.hypot(north);
     (length > 0.0).then(|| [east / length, north / length, -north / length, east / length])
 }

@@ -3,7 +3,7 @@
 
 use crate::kit::flow::{Vector, cross, direction, dot, unit};
 use crate::kit::netcdf::*;
-use crate::{HOURS, notes, open, open_with};
+use crate::{HOURS, notes, open, open_with, refused};
 use ridgewatch::field::Snapshot;
 use ridgewatch::source::SnapshotSource;
 use std::path::{Path, PathBuf};
@@ -146,6 +146,76 @@ fn tripolar(i: f64, j: f64) -> Vector {
     // On the plane that touches the pole, where 60 degrees north is a circle.
     let radius = 30f64.to_radians().tan();
     unit([radius * angle.cos(), radius * angle.sin() * height, 1.0])
+}
+
+/// MITgcm: u and v on faces whose dimensions have no coordinates of their own, half a cell west and south of the centres.
+#[test]
+fn faces_lie_half_a_cell_from_the_centres() {
+    let dir = tempdir().unwrap();
+    let (nx, ny) = (40, 30);
+    let write = |names: [&str; 2], shift: Option<f64>, moved: f64| {
+        let mut fixture = Fixture::new(NETCDF4, &[("time", 2), ("j", ny), ("i", nx), (names[1], ny), (names[0], nx)]);
+        fixture = fixture.axis("time", HOURS, &[0.0, 1.0]);
+        if let Some(shift) = shift {
+            let numbers = |n: usize| Data::F64((0..n).map(|i| i as f64).collect());
+            fixture = fixture.variable(names[0], &[names[0]], numbers(nx)).with("c_grid_axis_shift", shift).with("axis", "X");
+            fixture = fixture.variable(names[1], &[names[1]], numbers(ny)).with("c_grid_axis_shift", shift).with("axis", "Y");
+        }
+        for (k, (name, units)) in [("XC", "degrees_east"), ("YC", "degrees_north")].into_iter().enumerate() {
+            let values = fill(1, ny, nx, |_, j, i| degrees(patch(i as f64, j as f64))[k]);
+            fixture = fixture.variable(name, &["j", "i"], Data::F64(values)).with("units", units);
+        }
+        let half = shift.unwrap_or(-0.5);
+        for (c, (name, on)) in [("UVEL", ["j", names[0]]), ("VVEL", [names[1], "i"])].into_iter().enumerate() {
+            let at = |j: usize, i: usize| match c {
+                0 => [i as f64 + half, j as f64],
+                _ => [i as f64, j as f64 + half],
+            };
+            let values = fill(2, ny, nx, |_, j, i| {
+                let [x, y] = at(j, i);
+                let p = patch(x, y);
+                let along_x = along(&patch, x, y);
+                dot(cross(OMEGA, p), if c == 0 { along_x } else { cross(p, along_x) }) * moved
+            });
+            fixture = fixture.variable(name, &["time", on[0], on[1]], f32s(values)).with("units", "m s-1");
+        }
+        fixture.write(&dir.path().join(format!("{}.nc", names[0])))
+    };
+    for (names, shift) in [(["i_g", "j_g"], None), (["xf", "yf"], Some(-0.5)), (["right_x", "right_y"], Some(0.5))] {
+        let mut archive = open(&[write(names, shift, 1.0)]);
+        let (worst, known) = error(&archive.read(0).unwrap());
+        // Bilinear interpolation alone errs by 1e-5 here; half a cell of half a degree is 4e-3.
+        assert!(worst < 3e-4 && known > 0.4, "{names:?}: {worst} {known}");
+        assert!(
+            notes(&archive).contains("`UVEL` lies on faces without coordinates: half a cell from the points of `XC` and `YC`"),
+            "{}",
+            notes(&archive)
+        );
+    }
+}
+
+/// A component of another place or size is no partner.
+#[test]
+fn components_lie_beside_one_another() {
+    let dir = tempdir().unwrap();
+    let write = |name: &str, nx: usize, moved: f64, file: &str| {
+        let (ny, component) = (30, name.chars().next().unwrap());
+        let mut fixture = Fixture::new(NETCDF4, &[("time", 2), ("y", ny), ("x", nx)]).axis("time", HOURS, &[0.0, 1.0]);
+        for (k, (name, units)) in [("nav_lon", "degrees_east"), ("nav_lat", "degrees_north")].into_iter().enumerate() {
+            let values = fill(1, ny, nx, |_, j, i| degrees(patch(i as f64, j as f64))[k] - if k == 1 { moved } else { 0.0 });
+            fixture = fixture.variable(name, &["y", "x"], Data::F64(values)).with("units", units);
+        }
+        let standard = if component == 'u' { "sea_water_x_velocity" } else { "sea_water_y_velocity" };
+        fixture
+            .variable(name, &["time", "y", "x"], f32s(vec![0.1; 2 * nx * ny]))
+            .with("standard_name", standard)
+            .with("units", "m s-1")
+            .write(&dir.path().join(file))
+    };
+    let u = write("uo", 40, 0.0, "u.nc");
+    open(&[&u, &write("vo", 40, 0.0, "v.nc")]);
+    refused(&[&u, &write("vo", 40, 30.0, "far.nc")], "", &["at [0, 0] v lies at", "components of one mesh"]);
+    refused(&[&u, &write("vo", 30, 0.0, "small.nc")], "", &["v has 30 x 30 points, u (`nav_lon`) 40 x 30"]);
 }
 
 #[test]

@@ -319,7 +319,8 @@ fn partial_cells_by_a_field_that_is_named() {
     let heights = "heights = [-73.0, -70.0, -66.0, -40.0, -12.0]";
     assert!(layers.check(&mut open_with(&[&file], &format!("z = \"gdept_0\"\n{heights}"))) > 300);
     // Without the name levels are flat.
-    assert!(!notes(&open(&[&file])).contains("gdept_0"));
+    let flat = notes(&open(&[&file]));
+    assert!(flat.contains("--set archive.z=gdept_0 uses it") && !flat.contains("lies at the heights"), "{flat}");
 
     let [mut currents, mut mesh] = [with_depths(layers.fixture()), layers.fixture()];
     currents.variables.retain(|v| v.name != "gdept_0");
@@ -344,6 +345,10 @@ fn partial_cells_by_a_field_that_is_named() {
     let snapshot = archive.read(0).unwrap();
     let land = |i: usize| i.is_multiple_of(NX);
     assert!((0..snapshot.nodes.len()).all(|i| snapshot.nodes[i][3].is_nan() == land(i)));
+
+    let mut thick = with_depths(layers.fixture());
+    thick.variables.iter_mut().filter(|v| v.name == "gdept_0").for_each(|v| v.name = "e3t_0".into());
+    refused(&[thick.write(&dir.path().join("thick.nc"))], "z = \"e3t_0\"", &["`e3t_0`", "thicknesses of layers", "gdept_0"]);
 
     // A level that is selected is read as it is.
     let mut level = open_with(&[&file], "z = \"gdept_0\"\nselect.layer = 2");

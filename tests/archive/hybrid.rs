@@ -205,6 +205,25 @@ fn vertical_motion_on_half_levels() {
     );
 }
 
+/// CAM's names, in files that lost their `formula_terms`.
+#[test]
+fn hybrid_levels_are_known_by_the_names_of_cam() {
+    let dir = tempdir().unwrap();
+    let mut file = fixture(Says::Shares, "Pa/s", &|p| p, "Pa");
+    for variable in &mut file.variables {
+        variable.attributes.retain(|(name, _)| !["formula_terms", "standard_name"].contains(&name.as_str()));
+        match variable.name.as_str() {
+            "a" => variable.name = "hyam".into(),
+            "b" => variable.name = "hybm".into(),
+            "p0" => variable.name = "P0".into(),
+            _ => {}
+        }
+    }
+    let mut archive = open_with(&[file.write(&dir.path().join("cam.nc"))], "heights = [1500.0, 3000.0, 5000.0, 9000.0]");
+    let [known, above] = shares(&mut archive, 0);
+    assert!(known > 0.9 * above && notes(&archive).contains("pressure at the ground `PS`"), "{known} {above}: {}", notes(&archive));
+}
+
 #[test]
 fn levels_without_the_pressure_at_the_ground_say_what_is_missing() {
     let dir = tempdir().unwrap();

@@ -67,6 +67,38 @@ fn masks_by_convention_are_land() {
     }
 }
 
+/// POP counts the levels of water in each column: at the velocities' own points, or at tracers, of which four lie around a velocity.
+#[test]
+fn numbers_of_levels_that_are_water() {
+    let dir = tempdir().unwrap();
+    let (levels, depths) = (4, [5.0, 15.0, 25.0, 35.0]);
+    // Columns grow shallower to the east: 4, 4, 3, 3, 2, 2, 1, 0 levels.
+    let counts = [4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 1.0, 0.0];
+    let write = |name: &str| {
+        let x: Vec<f64> = (0..NX).map(|x| x as f64 * 0.1).collect();
+        let y: Vec<f64> = (0..NY).map(|y| 40.0 + y as f64 * 0.1).collect();
+        let axes: [(&str, &str, &[f64]); 4] =
+            [("time", HOURS, &[0.0, 1.0]), ("z_t", "m", &depths), ("lat", "degrees_north", &y), ("lon", "degrees_east", &x)];
+        let mut fixture = Fixture::on(NETCDF4, &axes);
+        fixture.variables.iter_mut().filter(|v| v.name == "z_t").for_each(|v| v.attributes.push(("positive".into(), "down".into())));
+        for component in ["UVEL", "VVEL"] {
+            fixture = fixture.fields("m s-1", [(component, f32s(fill(2 * levels, NY, NX, |n, _, x| 0.1 + 0.01 * (n + x) as f64)))]);
+        }
+        fixture.variable(name, &["lat", "lon"], f32s(fill(1, NY, NX, |_, _, x| counts[x]))).write(&dir.path().join(format!("{name}.nc")))
+    };
+    let own = write("KMU");
+    let mut archive = open(&[&own]);
+    let snapshot = archive.read(0).unwrap();
+    let z = snapshot.grid.axes[2].coordinates();
+    for (i, node) in snapshot.nodes.iter().enumerate() {
+        let (x, height) = (i % NX, z[i / (NX * NY)]);
+        assert_eq!(node[3].is_nan(), -height > depths[0] + 10.0 * (counts[x] - 1.0), "column {x}, {height} m");
+    }
+    assert!(notes(&archive).contains("the number of levels that are water"), "{}", notes(&archive));
+    assert_eq!(missing_columns(&[&own], "level = 25.0"), [4, 5, 6, 7]);
+    assert_eq!(missing_columns(&[&write("KMT")], "level = 25.0"), [3, 4, 5, 6, 7]);
+}
+
 #[test]
 fn a_mask_is_named() {
     let dir = tempdir().unwrap();
@@ -77,6 +109,9 @@ fn a_mask_is_named() {
     assert_eq!(missing_columns(&[&dry], "mask = \"!shore\""), DRY);
     assert_eq!(missing_columns(&[&wet], "mask = \"shore\""), DRY);
     refused(&[&wet], "mask = \"coast\"", &["`mask` = \"coast\"", "no file holds", "\"zero\"", "\"none\""]);
+    let odd = currents(["uo", "vo"], "").dimension("other", NX - 3).variable("umask", &["lat", "other"], f32s(vec![1.0; NY * (NX - 3)]));
+    let said = notes(&open(&[odd.write(&dir.path().join("odd.nc"))]));
+    assert!(said.contains("WARNING: the mask `umask` ([6, 5]) does not fit the points of `uo` ([2, 6, 8])"), "{said}");
     refused(&[&wet], "mask = \"lat\"", &["`mask` = \"lat\"", "shape is [6]", "[2, 6, 8]"]);
 }
 

@@ -24,17 +24,25 @@ fn months_are_no_time() {
         fixture = fixture.axis(name, units, &months).with("long_name", long_name);
         winds(fixture, 12).write(&dir.path().join(format!("{name}.nc")))
     };
-    for (name, units, long_name) in [
-        ("month", "", "month of the year"),
-        ("month", "1", ""),
-        ("time", "", "month"),
-        ("time", "months", ""),
-        ("time", "months since 2000-01-01", ""),
-        ("time", "years since 2000-01-01", ""),
+    for (name, units, long_name, counts) in [
+        ("month", "", "month of the year", "months"),
+        ("month", "1", "", "months"),
+        ("time", "", "month", "months"),
+        ("time", "months", "", "months"),
+        ("time", "months since 1999-12-01", "", "months"),
+        ("time", "years since 2000-01-01", "", "years"),
+        ("dayofyear", "", "", "days of a year"),
     ] {
         let file = climatology(name, units, long_name);
         for toml in [String::new(), format!("time = \"{name}\"")] {
-            refused(&[&file], &toml, &["counts months or years", "--set archive.units.time=\"30.4375 days\""]);
+            let length = match counts {
+                "months" => "30.4375 days",
+                "years" => "365.2425 days",
+                _ => "1 day",
+            };
+            let date = if units.contains("1999") { "since 1999-12-01\"" } else { "since 2000-01-01\"" };
+            let stated = format!("--set archive.units.time=\"{length}\"");
+            refused(&[&file], &toml, &[&format!("counts {counts}"), &stated, date]);
         }
         let mut archive = open_with(&[&file], "[units]\ntime = \"30.4375 days\"");
         assert_eq!((archive.times()[11] - archive.times()[0], archive.times().len()), (11.0 * 30.4375 * DAY, 12));
@@ -71,6 +79,8 @@ fn a_member_of_an_ensemble_is_selected() {
     let mut archive = open_with(&[&file], "select = { member = 3 }");
     assert_eq!((archive.grid().dimensions(), us(&archive.read(1).unwrap())[0]), (2, 7.0 * 9.0));
     assert!(notes(&archive).contains("entry 3 (13) of `member`, as set"), "{}", notes(&archive));
+    // Members are no levels, whatever their numbers.
+    refused(&[&file], "", &["dimension `member` has 4 entries", "--set archive.select.member=0"]);
     let bare = Fixture::new(CLASSIC, &[("time", 2), ("run", 4), ("y", 3), ("x", 3)]).axis("x", "m", &X).axis("y", "m", &X);
     let bare = winds(bare.axis("time", HOURS, &[0.0, 1.0]), 8).write(&dir.path().join("bare.nc"));
     refused(&[&bare], "", &["dimension `run` has 4 entries", "--set archive.select.run=0"]);

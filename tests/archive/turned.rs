@@ -77,21 +77,39 @@ fn winds_to_the_east_are_turned_onto_a_projection() {
     let y: Vec<f64> = (0..15).map(|i| -3e6 + 1e5 * f64::from(i)).collect();
     // Polar stereographic: meridian 0 runs down from the pole, which is the origin.
     let place = |x: f64, y: f64| [x.atan2(-y).to_degrees(), 90.0 - 2.0 * (x.hypot(y) / (2.0 * 6.371e6)).atan().to_degrees()];
-    let mut fixture = winds([("x", "m", &x), ("y", "m", &y)], EASTWARD, |_, _| [3.0, 4.0]);
-    for (k, (name, units)) in [("lon", "degrees_east"), ("lat", "degrees_north")].into_iter().enumerate() {
-        let values = (0..21 * 15).map(|i| place(x[i % 21], y[i / 21])[k]).collect();
-        fixture = fixture.variable(name, &["y", "x"], Data::F64(values)).with("units", units);
-    }
-    let file = fixture.write(&dir.path().join("polar.nc"));
+    // Metres of the plane in a metre on the ground.
+    let scale = |x: f64, y: f64| 1.0 + (x.hypot(y) / (2.0 * 6.371e6)).powi(2);
+    let write = |standard: [&str; 2], with_places: bool, name: &str| {
+        let mut fixture = winds([("x", "m", &x), ("y", "m", &y)], standard, |_, _| [3.0, 4.0]);
+        let axis = fixture.variables.iter_mut().find(|v| v.name == "x").unwrap();
+        axis.attributes.push(("standard_name".into(), "projection_x_coordinate".into()));
+        for (k, (name, units)) in [("lon", "degrees_east"), ("lat", "degrees_north")].into_iter().enumerate().filter(|_| with_places) {
+            let values = (0..21 * 15).map(|i| place(x[i % 21], y[i / 21])[k]).collect();
+            fixture = fixture.variable(name, &["y", "x"], Data::F64(values)).with("units", units);
+        }
+        fixture.write(&dir.path().join(name))
+    };
+    let file = write(EASTWARD, true, "polar.nc");
     let mut archive = open_with(&[&file], "metric = \"cartesian\"");
     let snapshot = archive.read(1).unwrap();
     assert_eq!(snapshot.grid.shape(), [21, 15, 1]);
     for (i, node) in snapshot.nodes.iter().enumerate() {
         let (sine, cosine) = x[i % 21].atan2(-y[i / 21]).sin_cos();
-        let expected = [3.0 * cosine - 4.0 * sine, 3.0 * sine + 4.0 * cosine];
+        let expected = [3.0 * cosine - 4.0 * sine, 3.0 * sine + 4.0 * cosine].map(|v| v * scale(x[i % 21], y[i / 21]));
         let error = (0..2).map(|k| (f64::from(node[k]) - expected[k]).abs()).fold(0.0, f64::max);
-        assert!(error < 5e-3, "node {i}: {error}");
+        assert!(error < 1e-2, "node {i}: {error}");
     }
+    assert!(notes(&archive).contains("by the longitudes and latitudes of the nodes"), "{}", notes(&archive));
+    // Winds that run along x and y are stretched alone.
+    let mut along = open_with(&[write(["x_wind", "y_wind"], true, "along.nc")], "metric = \"cartesian\"");
+    for (i, node) in along.read(1).unwrap().nodes.iter().enumerate() {
+        let expected = [3.0, 4.0].map(|v| v * scale(x[i % 21], y[i / 21]));
+        let error = (0..2).map(|k| (f64::from(node[k]) - expected[k]).abs()).fold(0.0, f64::max);
+        assert!(error < 1e-2, "node {i}: {error}");
+    }
+    assert!(notes(&along).contains("stretched to the metres of the projection by the longitudes and latitudes"), "{}", notes(&along));
+    let lost = notes(&open_with(&[write(["x_wind", "y_wind"], false, "lost.nc")], "metric = \"cartesian\""));
+    assert!(lost.contains("a metre along x and y is taken as a metre on the ground"), "{lost}");
 }
 
 /// A pole has no east: what lies beside it tells, and all other nodes are as they are.

@@ -344,6 +344,22 @@ fn components_and_mesh_in_files_of_their_own() {
     // The flow is slower at depth.
     let (worst, known) = error(&part.read(0).unwrap(), |_| 0.95);
     assert!(worst < 1e-3 && known == 1.0, "{worst} {known}");
+    // ICON: the output names its points otherwise than the file of the mesh, which alone has their places.
+    let corners = triangles(&faces);
+    let middles = triangle_middles(&nodes, &corners);
+    let icon = velocities(times(&[("ncells", middles.len())]), "ncells", &middles, &[]).write(&dir.path().join("output.nc"));
+    let grid = Fixture::new(NETCDF4, &[("cell", middles.len()), ("vertex", nodes.len()), ("nv", 3)]);
+    let grid = coordinates(grid, "vertex", ["vlon", "vlat"], &nodes, true).variable("vertex_of_cell", &["nv", "cell"], Data::F64(corners));
+    let grid = coordinates(grid, "cell", ["clon", "clat"], &middles, true).write(&dir.path().join("grid.nc"));
+    check_basin("ICON", &mut open(&[icon, grid]), 2e-2);
+    // SCHISM: the topology alone says what the coordinates are.
+    let schism = velocities(times(&[("node", nodes.len()), ("topology", 1)]), "node", &nodes, &[]);
+    let mut schism = coordinates(schism, "node", ["SCHISM_hgrid_node_x", "SCHISM_hgrid_node_y"], &nodes, false);
+    schism.variables.iter_mut().filter(|v| v.name.starts_with("SCHISM")).for_each(|v| v.attributes.clear());
+    let schism = schism.variable("SCHISM_hgrid", &["topology"], Data::F64(vec![0.0])).with("cf_role", "mesh_topology");
+    let schism = schism.with("node_coordinates", "SCHISM_hgrid_node_x SCHISM_hgrid_node_y").write(&dir.path().join("schism.nc"));
+    let (worst, _) = error(&open(&[schism]).read(0).unwrap(), |_| 1.0);
+    assert!(worst < 1e-3, "{worst}");
     // Without the mesh nothing says where the values lie.
     refused(&files[..2], "level = 50", &["unstructured mesh, name the file of their longitudes and latitudes too"]);
 }

@@ -15,8 +15,8 @@ use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::georeference::Georeference;
 use crate::grids::{
-    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, Role, VelocityScale, ZERO,
-    difference, holds_mask, plan, read_component, read_levels, slab_of,
+    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, ResamplingError, Role, SCALE_HEIGHT, VelocityScale,
+    ZERO, difference, holds_mask, plan, read_component, read_levels, slab_of,
 };
 use crate::ground::GroundToGrid;
 use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_gaps};
@@ -80,6 +80,8 @@ pub struct Archive {
     georeference: Georeference,
     description: SourceDescription,
     pub(super) open: Option<OpenFile>,
+    /// Time at which the error of a resampling is measured.
+    measured_at: usize,
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
     pub(super) limits: Limits,
@@ -246,6 +248,7 @@ impl Archive {
             georeference,
             description,
             open,
+            measured_at: 0,
             expected: expected.map(|listing| listing.part(&names)),
             limits,
             settings: settings.clone(),
@@ -545,7 +548,8 @@ impl Archive {
         }
         self.poles.extend(&mut components, self.axes[0].axis.coordinates(), self.axes[1].order.len());
         if self.settings.wants_continuity() {
-            components.push(vertical_velocity(&self.grid, &components[0], &components[1]));
+            let scale_height = plans[0].of_air.then_some(SCALE_HEIGHT * self.settings.vertical_scale.unwrap_or(1.0));
+            components.push(vertical_velocity(&self.grid, &components[0], &components[1], scale_height));
         }
         Ok(components)
     }
@@ -560,9 +564,18 @@ impl Archive {
             let held = self.times.len().min(WINDOW) * size_of::<[f32; 4]>();
             let node = MESH_NODE_BYTES + (NODE_BYTES + held as u64) * levels as u64;
             let most = self.limits.memory / 2 / node;
-            let Place { file: index, frame, entry } = self.open_at(0)?;
-            let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
-            let truth = mesh.truth(file, &self.files[index].frames[frame], entry, false)?;
+            // A run may begin at rest.
+            let mut truth = None;
+            for time in [0, self.times.len() / 2, self.times.len() - 1] {
+                let Place { file: index, frame, entry } = self.open_at(time)?;
+                let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
+                let found = truth.insert(mesh.truth(file, &self.files[index].frames[frame], entry, false)?);
+                self.measured_at = time;
+                if found.moves() {
+                    break;
+                }
+            }
+            let Some(truth) = truth else { return Err(SourceError::NoFiles) };
             refined = mesh.refined(&truth, usize::try_from(most).unwrap_or(usize::MAX), levels);
         }
         self.description.notes.push(refined.what());
@@ -588,10 +601,10 @@ impl Archive {
         self.resampling.as_ref().map(|resampling| (resampling.what(), resampling.warning(error)))
     }
 
-    /// Error of the resampling on the first snapshot, if anything is resampled. See [`Resampling::error`].
+    /// Error of the resampling on the first snapshot that moves, if anything is resampled. See [`Resampling::error`].
     pub(super) fn resampling_error(&mut self) -> Result<Option<ResamplingError>, SourceError> {
         let Some(resampling) = self.resampling.clone() else { return Ok(None) };
-        let Place { file: index, frame, entry } = self.open_at(0)?;
+        let Place { file: index, frame, entry } = self.open_at(self.measured_at)?;
         let Some(OpenFile { data: file, .. }) = &self.open else { return Err(SourceError::NoFiles) };
         resampling.error(file, &self.files[index].frames[frame], entry).map(Some)
     }

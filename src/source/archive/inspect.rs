@@ -224,7 +224,7 @@ fn variables(listing: &Listing, settings: &ArchiveSettings) -> Vec<VariableRepor
             units: variable.units().map(str::to_owned),
             role: None,
             why: match velocity::judge(listing, i, settings.velocity_units()) {
-                Ok(candidate) => format!("may be {}, but another was chosen: {}", candidate.component.name(), candidate.why),
+                Ok(candidate) => format!("may be {}: {}", candidate.component.name(), candidate.why),
                 Err(lacks) => lacks,
             },
         }

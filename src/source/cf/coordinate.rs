@@ -72,9 +72,9 @@ pub fn classify(variable: &Variable) -> Kind {
 pub fn classify_name(name: &str) -> Kind {
     match name.to_ascii_lowercase().as_str() {
         "lon" | "longitude" | "longitudes" | "lons" | "nav_lon" | "rlon" | "xlong" | "grid_longitude" | "glamt" | "glamu" | "glamv"
-        | "glamf" | "lonc" | "clon" | "loncell" => Kind::Longitude,
+        | "glamf" | "lonc" | "clon" | "vlon" | "loncell" | "λ_faa" | "λ_caa" => Kind::Longitude,
         "lat" | "latitude" | "latitudes" | "lats" | "nav_lat" | "rlat" | "xlat" | "grid_latitude" | "gphit" | "gphiu" | "gphiv"
-        | "gphif" | "latc" | "clat" | "latcell" => Kind::Latitude,
+        | "gphif" | "latc" | "clat" | "vlat" | "latcell" | "φ_afa" | "φ_aca" => Kind::Latitude,
         "x" | "xc" | "nx" | "easting" | "west_east" | "xu_ocean" | "xt_ocean" | "xcoor" | "x_coordinate" | "x_rho" | "x_u" | "x_v"
         | "xg" | "xp1" | "xf" | "xq" | "xh" | "x_faa" | "x_caa" => Kind::X,
         "y" | "yc" | "ny" | "northing" | "south_north" | "yu_ocean" | "yt_ocean" | "ycoor" | "y_coordinate" | "y_rho" | "y_u" | "y_v"
@@ -82,7 +82,8 @@ pub fn classify_name(name: &str) -> Kind {
         "z" | "zc" | "nz" | "nz1" | "lev" | "level" | "levels" | "plev" | "pressure" | "pressure_level" | "isobaric" | "depth"
         | "deptht" | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor"
         | "zl" | "zu" | "zp1" | "zf" | "z_aaf" | "z_aac" | "sw_ocean" => Kind::Level,
-        "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" | "month" | "months" => Kind::Time,
+        "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" | "month" | "months" | "dayofyear"
+        | "day_of_year" => Kind::Time,
         _ => Kind::Unknown,
     }
 }

@@ -42,6 +42,7 @@ impl Planner<'_> {
                 || (of_u.is_none_or(|of_u| of_u == dimension) && self.variable(i).number.is_number() && levels(i).is_some_and(is_level))
         };
         let unit = |i: usize| self.axis_units(Kind::Level, i).and_then(Unit::parse);
+        let len_of = |d: usize| self.listing().dimensions[d].len;
         let named = self.named_heights();
         if let Some(named) = named.filter(as_many) {
             return Some(named);
@@ -49,6 +50,14 @@ impl Planner<'_> {
         let is_measured = |unit: Unit| unit.is_length() || unit.is_pressure();
         if named.is_none() && self.measured(dimension).coordinate.and_then(unit).is_some_and(is_measured) {
             return None;
+        }
+        // In NEMO's meshes `gdepw_0` lies between `gdept_0`.
+        let between =
+            named.and_then(|named| self.listing().find(&self.variable(named).name.replace("gdept", "gdepw"))).filter(|i| Some(*i) != named);
+        if let Some(between) =
+            between.filter(|_| of_u.is_some()).filter(|i| along(i) || levels(*i).is_some_and(|d| len_of(d) == len_of(dimension)))
+        {
+            return Some(between);
         }
         let names = self.variable(variable).text("coordinates")?;
         // Levels whose kind of height is named may be told by other fields of this kind.
@@ -101,6 +110,14 @@ impl Planner<'_> {
                 }
             },
         };
+        let named = |text: &str| text.to_ascii_lowercase().contains("thickness");
+        let variable = self.variable(field);
+        if named(&variable.name)
+            || ["standard_name", "long_name"].iter().any(|name| variable.text(name).is_some_and(named))
+            || is_scale_factor(&variable.name)
+        {
+            return Err(self.misfit(field, "it holds thicknesses of layers; `z` must name their heights or depths (in NEMO `gdept_0`)"));
+        }
         let count = heights.along(2);
         let (mut sum, mut below) = (0.0, Vec::new());
         // Of each pair of levels: in how many columns more the numbers ascend than descend.
@@ -138,6 +155,12 @@ impl Planner<'_> {
         let sign = if is_down { -1.0 } else { 1.0 };
         Ok(Told { factor: sign * factor, is_pressure, ascends: grows != is_down, is_of_air: sign * sum > 0.0 })
     }
+}
+
+/// True for NEMO's thicknesses: `e3t_0`, `e3u` and the like.
+fn is_scale_factor(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    name.starts_with("e3") && name.len() > 2
 }
 
 /// What a field tells of its levels.

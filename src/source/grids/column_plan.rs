@@ -76,7 +76,10 @@ impl Planner<'_> {
         {
             return Err(self.misfit(field, self.of_other_levels(u)));
         }
-        let Some((dimension, columns)) = found else { return Ok(None) };
+        let Some((dimension, columns)) = found else {
+            self.note_depths_of_points(u);
+            return Ok(None);
+        };
         let Some(extent) = extents.iter_mut().find(|e| e.dimension == dimension) else { return Ok(None) };
         extent.kind = Kind::Level;
         let mut found = vec![Some((dimension, columns))];
@@ -140,6 +143,29 @@ impl Planner<'_> {
         self.note(format!("`{level}` {lie}: each column is interpolated between its own levels {to} ({why}); below {under} it is missing"));
         let with_heights = |(dimension, columns): (usize, Columns)| (dimension, Arc::new(Columns { heights: heights.clone(), ..columns }));
         Ok(Some(Terrain { of: found.into_iter().map(|found| found.map(with_heights)).collect(), heights, is_of_air }))
+    }
+
+    /// Tells of NEMO's depths of every point (partial cells), which are used only if they are named.
+    fn note_depths_of_points(&mut self, u: usize) {
+        let shape = self.shape(u);
+        let fits = |v: &Variable| {
+            let own = self.listing().shape(v);
+            v.name.to_ascii_lowercase().starts_with("gdept")
+                && own.len() >= 3
+                && shape.len() >= 3
+                && own[own.len() - 3..] == shape[shape.len() - 3..]
+        };
+        let found = self
+            .listing()
+            .matching(fits)
+            .next()
+            .filter(|_| !self.counts_cells() && self.settings.z.is_none() && self.settings.level.is_none());
+        if let Some(found) = found {
+            let name = &self.variable(found).name;
+            self.note(format!(
+                "`{name}` tells the depth of every point, such as of partial cells at the bottom: --set archive.z={name} uses it"
+            ));
+        }
     }
 
     /// True if cells are those of the file, so that its levels are no heights.
@@ -425,6 +451,9 @@ impl Planner<'_> {
 
     /// Terms by the names of ROMS and CROCO.
     fn by_names(&mut self, dimension: usize) -> Result<Option<Terms>, SourceError> {
+        if let Some(terms) = self.by_hybrid_names(dimension)? {
+            return Ok(Some(terms));
+        }
         let name = &self.listing().dimensions[dimension].name;
         let Some([s, stretching]) = NAMES.iter().find(|names| names[0].contains(&name.as_str())) else { return Ok(None) };
         let (Some(s), Some(stretching)) = (self.along_levels(s, dimension)?, self.along_levels(stretching, dimension)?) else {
@@ -444,6 +473,18 @@ impl Planner<'_> {
         };
         let levels = s.into_iter().zip(stretching).map(|(s, c)| [s, c]).collect();
         Ok(Some(Terms { formula, levels, critical_depth, ground: depth, surface: self.listing().find("zeta") }))
+    }
+
+    /// Levels of CAM, in files that lost their `formula_terms`: pressures `hyam` P0 + `hybm` PS.
+    fn by_hybrid_names(&self, dimension: usize) -> Result<Option<Terms>, SourceError> {
+        let (Some(a), Some(b)) = (self.along_levels(&["hyam"], dimension)?, self.along_levels(&["hybm"], dimension)?) else {
+            return Ok(None);
+        };
+        let (Some(ground), false) = (self.listing().find("PS").or(self.listing().find("ps")), self.counts_cells()) else { return Ok(None) };
+        let unit = self.listing().find("P0").and_then(|index| Unit::parse(self.variable(index).units()?)).filter(Unit::is_pressure);
+        let reference = self.scalar(&["P0"])?.map_or(REFERENCE_PRESSURE, |p| p * unit.map_or(1.0, |unit| unit.factor));
+        let levels = a.into_iter().zip(b).map(|(a, b)| [a * reference, b]).collect();
+        Ok(Some(Terms { formula: Formula::Hybrid, levels, critical_depth: 0.0, ground, surface: None }))
     }
 
     /// The first of some numbers: a variable of one entry, or an attribute of the file.
@@ -522,6 +563,7 @@ impl Planner<'_> {
             factor: unit.map_or(1.0, |unit| unit.factor),
             why: String::new(),
             of_water: false,
+            of_air: false,
             mask: None,
             columns: None,
             own: Default::default(),

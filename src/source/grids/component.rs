@@ -32,8 +32,9 @@ pub struct ComponentPlan {
     pub factor: f64,
     /// Why it was chosen.
     pub why: String,
-    /// True if its names say that it is a velocity of water.
+    /// True if its names say that it is a velocity of water, and of air.
     pub of_water: bool,
+    pub of_air: bool,
     /// Its points on land.
     pub mask: Option<Arc<Mask>>,
     /// Levels that follow the bottom, and the heights that they are interpolated to.

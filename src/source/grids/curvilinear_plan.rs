@@ -2,7 +2,7 @@
 
 use super::axes::AxisPlan;
 use super::column_plan::Terrain;
-use super::component::Role;
+use super::component::{ComponentPlan, Role};
 use super::curvilinear::Curvilinear;
 use super::dimensions::Extent;
 use super::layout::{Layout, Resampling};
@@ -28,6 +28,8 @@ pub struct Points {
     pub plane: [usize; 2],
     /// True along axes on which they lie between the points of the pair.
     pub between: [bool; 2],
+    /// -1 or 1 along axes on which they lie half a cell before or behind the points of the pair.
+    pub shift: [i8; 2],
     pub cells: Cells,
 }
 
@@ -84,6 +86,13 @@ impl Planner<'_> {
                 let [name, longitude, latitude] = [candidate.variable, points.pair[0], points.pair[1]].map(|i| &self.variable(i).name);
                 self.note(format!(
                     "`{name}` has no coordinates of its own: its points lie between those of `{longitude}` and `{latitude}`"
+                ));
+            }
+            if points.shift != [0; 2] {
+                let [name, longitude, latitude] = [candidate.variable, points.pair[0], points.pair[1]].map(|i| &self.variable(i).name);
+                self.note(format!(
+                    "`{name}` lies on faces without coordinates: half a cell from the points of `{longitude}` and `{latitude}`, by `c_grid_axis_shift` or its \
+                     dimension's name"
                 ));
             }
         }
@@ -153,12 +162,23 @@ impl Planner<'_> {
         let on = |&[lon, _]: &Pair| {
             let plane = self.plane_of(lon);
             let own = plane.iter().all(|d| wide.contains(d));
-            own.then_some(Points { pair: [0; 2], plane, between: [false; 2], cells: Cells::Rows })
+            own.then_some(Points { pair: [0; 2], plane, between: [false; 2], shift: [0; 2], cells: Cells::Rows })
         };
         let beside = |&[lon, _]: &Pair| {
             let more = [0, 1].map(|k| length(self.plane_of(lon)[k]) as i64 - length([x, y][k]) as i64);
             let between = more.map(|more| more == 1);
-            (more.iter().all(|more| (0..=1).contains(more))).then_some(Points { pair: [0; 2], plane: [x, y], between, cells: Cells::Rows })
+            let same_part = self.file.origin(lon).0 == self.file.origin(variable).0;
+            let shift = [0, 1].map(|k| match (self.plane_of(lon)[k], [x, y][k]) {
+                (of_pair, own) if same_part && more[k] == 0 && of_pair != own => self.face_shift(own) - self.face_shift(of_pair),
+                _ => 0,
+            });
+            (more.iter().all(|more| (0..=1).contains(more))).then_some(Points {
+                pair: [0; 2],
+                plane: [x, y],
+                between,
+                shift,
+                cells: Cells::Rows,
+            })
         };
         let choices: [&dyn Fn(&Pair) -> Option<Points>; 2] = [&on, &beside];
         for points_of in choices {
@@ -171,6 +191,19 @@ impl Planner<'_> {
             }
         }
         Ok(None)
+    }
+
+    /// Half cells by which faces along a dimension lie from the centres: by the attribute of SGRID and xgcm, or by the names of MITgcm.
+    fn face_shift(&self, dimension: usize) -> i8 {
+        let name = &self.listing().dimensions[dimension].name;
+        let of = self.listing().matching(|v| v.dimensions == [dimension] && v.name == *name).next();
+        let stated = of.and_then(|index| self.variable(index).numbers("c_grid_axis_shift").first().copied());
+        match stated {
+            Some(shift) if shift != 0.0 => shift.signum() as i8,
+            _ if name.ends_with("_g") || name.ends_with("_left") => -1,
+            _ if name.ends_with("_right") => 1,
+            _ => 0,
+        }
     }
 
     /// True if longitudes and latitudes are of the same points.
@@ -211,7 +244,7 @@ impl Planner<'_> {
         let mut mesh = Mesh::rows(shape, self.degrees(longitude, None)?, self.degrees(latitude, None)?);
         self.check_latitudes(latitude, &mesh.latitude)?;
         mesh.leave_out_zeros();
-        Ok(mesh.between(points.between))
+        Ok(mesh.between(points.between).shifted(points.shift))
     }
 
     /// Refuses latitudes beyond the poles.
@@ -259,7 +292,8 @@ impl Planner<'_> {
                 }
                 continue;
             }
-            let whole = if points.between == [false; 2] { None } else { Some(self.mesh(points)?) };
+            let is_own = points.between == [false; 2] && points.shift == [0; 2];
+            let whole = if is_own { None } else { Some(self.mesh(points)?) };
             let whole = [whole.as_ref().map(|mesh| &mesh.longitude), whole.as_ref().map(|mesh| &mesh.latitude)];
             for ((&index, known), whole) in points.pair.iter().zip([&mesh.longitude, &mesh.latitude]).zip(whole) {
                 for row in [0, mesh.shape[1] - 1] {
@@ -360,6 +394,9 @@ impl Planner<'_> {
         if levels[0] != levels[1] {
             return Err(self.misfit(velocity.v.variable, format!("u has {} levels, v {}", levels[0], levels[1])));
         }
+        if three && terrain.is_none() {
+            self.check_same_levels(velocity, &components)?;
+        }
         let w = self.vertical_candidate(velocity, terrain.as_ref());
         let w = self.vertical_component(w, roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three, terrain.as_ref())?;
         match w {
@@ -385,6 +422,57 @@ impl Planner<'_> {
         Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: Some(resampling), notes: self.notes })
     }
 
+    /// Refuses levels of v that lie elsewhere than those of u: they are read one for one.
+    fn check_same_levels(&self, velocity: &Velocity, components: &[ComponentPlan]) -> Result<(), SourceError> {
+        let levels = |which: usize, variable: usize| {
+            let place = components[which].roles.iter().position(|role| *role == Role::Axis(2));
+            place.and_then(|place| self.measured(self.variable(variable).dimensions[place]).coordinate)
+        };
+        let [u, v] = [velocity.u.variable, velocity.v.variable];
+        let (Some(of_u), Some(of_v)) = (levels(0, u), levels(1, v)) else { return Ok(()) };
+        if of_u == of_v {
+            return Ok(());
+        }
+        let [here, there] = [self.coordinate_values(of_u)?, self.coordinate_values(of_v)?];
+        let scale = here.iter().fold(0.0f64, |most, value| most.max(value.abs()));
+        match here.iter().zip(&there).position(|(a, b)| (a - b).abs() > 1e-4 * scale) {
+            None => Ok(()),
+            Some(k) => {
+                let name = &self.variable(u).name;
+                let what = format!(
+                    "level {k} of it lies at {}, that of `{name}` at {}: accepted are components on the same levels",
+                    there[k], here[k]
+                );
+                Err(self.misfit(v, what))
+            }
+        }
+    }
+
+    /// Refuses points of v that are not those beside the points of u.
+    fn check_beside(&self, points: &[Points], meshes: &[Arc<Mesh>]) -> Result<(), SourceError> {
+        let ([u, v], Cells::Rows) = ([&meshes[0], &meshes[1]], points[0].cells) else { return Ok(()) };
+        let names = [0, 1].map(|k| &self.variable(points[k].pair[0]).name);
+        let fault = |what: String| Err(self.misfit(points[1].pair[0], format!("{what}: accepted are components of one mesh")));
+        if (0..2).any(|k| u.shape[k].abs_diff(v.shape[k]) > 1) {
+            return fault(format!("v has {} x {} points, u (`{}`) {} x {}", v.shape[0], v.shape[1], names[0], u.shape[0], u.shape[1]));
+        }
+        let [nx, ny] = [0, 1].map(|k| u.shape[k].min(v.shape[k]));
+        let apart = |a: [f64; 2], b: [f64; 2]| {
+            let east = (b[0] - a[0] + 180.0).rem_euclid(360.0) - 180.0;
+            (east * a[1].to_radians().cos()).hypot(b[1] - a[1])
+        };
+        let known = (0..ny).flat_map(|j| (0..nx.saturating_sub(1)).map(move |i| (i, j))).find_map(|(i, j)| {
+            let (here, next, there) = (u.point(i, j)?, u.point(i + 1, j)?, v.point(i, j)?);
+            Some(([i, j], here, there, apart(here, there), apart(here, next)))
+        });
+        match known {
+            Some((place, here, there, distance, spacing)) if distance > 4.0 * spacing.max(1e-6) => {
+                fault(format!("at {place:?} v lies at {there:.3?} degrees, u (`{}`) at {here:.3?}", names[0]))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Makes the grid, at the mesh's own spacing unless one is set, and locates its nodes among the points of each component.
     fn resample(&mut self, points: &[Points], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
         let mut meshes: Vec<Arc<Mesh>> = Vec::new();
@@ -393,6 +481,7 @@ impl Planner<'_> {
             let twin = points[..k].iter().position(|other| other == own);
             meshes.push(twin.map_or_else(|| self.mesh(own).map(Arc::new), |twin| Ok(meshes[twin].clone()))?);
         }
+        self.check_beside(points, &meshes)?;
         let resolution = self.settings.resolution;
         let target = target(&meshes[0], resolution, self.settings.region).map_err(|what| self.misfit(points[0].pair[0], what))?;
         let (along, why) = self.runs_along_grid(u, points[0].cells);

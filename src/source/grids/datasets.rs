@@ -336,6 +336,7 @@ impl Planner<'_> {
             factor,
             why,
             of_water: false,
+            of_air: false,
             mask: None,
             columns: None,
             own: Default::default(),

@@ -137,7 +137,9 @@ impl Planner<'_> {
                 (Kind::X, "x")
             } else if !has(extents, [Kind::Y, Kind::Latitude]) {
                 (Kind::Y, "y")
-            } else if !has(extents, [Kind::Level; 2]) && extents[i].coordinate.is_some() {
+            } else if !has(extents, [Kind::Level; 2])
+                && extents[i].coordinate.is_some_and(|c| !self.counts_members(extents[i].dimension, c))
+            {
                 (Kind::Level, "z")
             } else {
                 let what = format!(
@@ -170,6 +172,17 @@ impl Planner<'_> {
             }
         }
         Ok(())
+    }
+
+    /// True if the entries of a dimension are members of an ensemble.
+    fn counts_members(&self, dimension: usize, coordinate: usize) -> bool {
+        let name = self.listing().dimensions[dimension].name.to_ascii_lowercase();
+        self.variable(coordinate).text("standard_name") == Some("realization")
+            || ["number", "member", "realization", "realisation", "ensemble", "ens"]
+                .iter()
+                .any(|word| name == *word || name == format!("{word}s"))
+            || name.starts_with("ensemble_")
+            || name.ends_with("_member")
     }
 
     /// Dimension and index of the level that the settings pick.

@@ -142,6 +142,33 @@ impl Mesh {
         Self::rows(shape, longitude, latitude)
     }
 
+    /// The points half a cell before (-1) or behind (1) these along each axis; at an end as far beyond it as the last cell tells.
+    pub fn shifted(mut self, shift: [i8; 2]) -> Self {
+        for (axis, &half) in shift.iter().enumerate().filter(|(_, half)| **half != 0) {
+            let last = self.shape[axis] - 1;
+            let own = |place: [usize; 2]| {
+                let n = place[1] * self.shape[0] + place[0];
+                vector(self.longitude[n], self.latitude[n])
+            };
+            let (mut longitude, mut latitude) = (Vec::new(), Vec::new());
+            for (j, i) in (0..self.shape[1]).flat_map(|j| (0..self.shape[0]).map(move |i| (j, i))) {
+                let at = |n: usize| own(if axis == 0 { [n, j] } else { [i, n] });
+                let n = [i, j][axis];
+                let pairs = match (half < 0, n) {
+                    (true, 0) => [(at(0), 1.5), (at(1.min(last)), -0.5)],
+                    (true, n) => [(at(n - 1), 0.5), (at(n), 0.5)],
+                    (false, n) if n == last => [(at(n), 1.5), (at(n.saturating_sub(1)), -0.5)],
+                    (false, n) => [(at(n), 0.5), (at(n + 1), 0.5)],
+                };
+                let [east, north] = degrees(std::array::from_fn(|k| pairs.iter().map(|(v, weight)| weight * v[k]).sum()));
+                longitude.push(east);
+                latitude.push(north);
+            }
+            self = Self::rows(self.shape, longitude, latitude);
+        }
+        self
+    }
+
     pub fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
         let n = j * self.shape[0] + i;
         (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])

@@ -42,6 +42,8 @@ enum Water {
     Little,
     /// These flags.
     Flags(Vec<f64>),
+    /// The number of levels, from the surface, that are water (POP); at a velocity's corner the least of the four around it if `is_around`.
+    Levels { is_around: bool },
 }
 
 impl Water {
@@ -54,6 +56,7 @@ impl Water {
                 Self::Much => value >= 0.5,
                 Self::Little => value < 0.5,
                 Self::Flags(values) => values.contains(&value),
+                Self::Levels { .. } => value > 0.0,
             }
     }
 
@@ -90,6 +93,7 @@ impl Water {
             Self::Much => "from 0.5 on it is water".into(),
             Self::Little => "from 0.5 on it is land".into(),
             Self::Flags(values) => format!("{values:?} is water"),
+            Self::Levels { .. } => "the number of levels that are water".into(),
         }
     }
 }
@@ -159,6 +163,8 @@ fn candidate(listing: &Listing, plan: &ComponentPlan, which: usize, settings: &A
                 (variable.name == opposite.unwrap_or(named)).then(|| (0, Water::of_named(variable, opposite.is_some())))?
             }
             None => match MODELS.iter().find_map(|names| names.iter().position(|n| *n == name)) {
+                None if name == "kmu" && which < 2 => (0, Water::Levels { is_around: false }),
+                None if name == "kmt" => (1, Water::Levels { is_around: which < 2 }),
                 Some(points) if points == which => (0, Water::NotZero),
                 Some(2) => (1, Water::NotZero),
                 Some(_) => return None,
@@ -177,7 +183,7 @@ pub fn holds_mask(listing: &Listing, settings: &ArchiveSettings) -> bool {
         Some(named) if ![NO_MASK, ZERO].contains(&named) => v.name == named.strip_prefix('!').unwrap_or(named),
         _ => {
             let name = v.name.to_ascii_lowercase();
-            MODELS.iter().flatten().any(|n| *n == name) || Water::declared(v).is_some()
+            MODELS.iter().flatten().any(|n| *n == name) || ["kmu", "kmt"].contains(&name.as_str()) || Water::declared(v).is_some()
         }
     })
 }
@@ -200,6 +206,20 @@ impl Masks {
         let (mut lacking, mut used) = (Vec::new(), Vec::<(usize, String)>::new());
         for (which, plan) in frame.iter().enumerate().take(3) {
             let Some(best) = candidate(listing, plan, which, settings) else {
+                let of_models = |v: &Variable| {
+                    let name = v.name.to_ascii_lowercase();
+                    MODELS.iter().any(|names| names[which] == name || names[2] == name)
+                };
+                if let (None, Some(odd)) = (&settings.mask, listing.matching(of_models).next()) {
+                    let odd = &listing.variables[odd];
+                    self.notes.push(format!(
+                        "WARNING: the mask `{}` ({:?}) does not fit the points of `{}` ({:?}), and is not used",
+                        odd.name,
+                        listing.shape(odd),
+                        plan.name,
+                        plan.shape
+                    ));
+                }
                 lacking.push(plan);
                 continue;
             };
@@ -246,8 +266,11 @@ fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<
         Along::Entry(entry) => (entry.min(len.saturating_sub(1)), 1),
     };
     let (start, count): (Vec<usize>, Vec<usize>) = candidate.along.iter().zip(&lengths).map(part).unzip();
-    let water: Vec<bool> =
-        file.read(candidate.variable, start, count.clone())?.into_iter().map(|v| candidate.water.holds(packing.unpack(v))).collect();
+    let values: Vec<f64> = file.read(candidate.variable, start, count.clone())?.into_iter().map(|v| packing.unpack(v)).collect();
+    if let Water::Levels { is_around } = candidate.water {
+        return Ok(Mask::new(&variable.name, [plan.along(0), plan.along(1), plan.along(2)], below_bottom(&values, plan, is_around)));
+    }
+    let water: Vec<bool> = values.into_iter().map(|value| candidate.water.holds(value)).collect();
     // Extent and distance between neighbours along each axis of the grid.
     let (mut extent, mut strides, mut stride) = ([1usize; 3], [0usize; 3], 1);
     for (along, &n) in candidate.along.iter().zip(&count).rev() {
@@ -271,12 +294,48 @@ fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<
     Ok(Mask::new(&variable.name, shape, land))
 }
 
+/// Points of a component that are land or rock, by the numbers of levels that are water in its columns (x fastest), or in the columns around its points.
+fn below_bottom(levels: &[f64], plan: &ComponentPlan, is_around: bool) -> Vec<bool> {
+    let [nx, ny, nz] = [0, 1, 2].map(|k| plan.along(k));
+    // The one level that is read, of those that the columns count.
+    let most = levels.iter().copied().filter(|n| n.is_finite()).fold(0.0, f64::max);
+    let fixed = plan.roles.iter().zip(&plan.shape).find_map(|(role, &len)| match role {
+        Role::Fixed(entry) if len > 1 && len as f64 >= most => Some(*entry),
+        _ => None,
+    });
+    let wet = |x: usize, y: usize| levels.get(y * nx + x).copied().filter(|n| n.is_finite()).unwrap_or(0.0);
+    let around = |x: usize, y: usize| match is_around {
+        true => [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)]
+            .iter()
+            .map(|&(x, y)| wet(x.min(nx - 1), y.min(ny - 1)))
+            .fold(f64::INFINITY, f64::min),
+        false => wet(x, y),
+    };
+    let mut land = Vec::with_capacity(nx * ny * nz);
+    for z in 0..nz {
+        let level = if nz == 1 { fixed.unwrap_or(0) } else { z };
+        land.extend((0..nx * ny).map(|n| around(n % nx, n / nx) <= level as f64));
+    }
+    land
+}
+
+/// Standard name and long name, in small letters.
+fn words_of(variable: &Variable) -> String {
+    let of = |name: &str| variable.text(name).unwrap_or_default().to_ascii_lowercase();
+    format!("{} {}", of("standard_name"), of("long_name"))
+}
+
+/// True if a velocity is of air, as far as its names say.
+pub fn is_of_air(variable: &Variable) -> bool {
+    let words = words_of(variable);
+    ["wind", "air", "atmos"].iter().any(|part| words.contains(part))
+}
+
 /// True if a velocity is of water, as far as its names say.
 pub fn is_of_water(listing: &Listing, variable: &Variable) -> bool {
-    let of = |name: &str| variable.text(name).unwrap_or_default().to_ascii_lowercase();
-    let words = format!("{} {}", of("standard_name"), of("long_name"));
+    let words = words_of(variable);
     let says = |words: &str, parts: &[&str]| parts.iter().any(|part| words.contains(part));
-    if says(&words, &["wind", "air", "atmos"]) {
+    if is_of_air(variable) {
         return false;
     }
     let name = variable.name.to_ascii_lowercase();

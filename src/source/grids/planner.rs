@@ -5,7 +5,7 @@ use super::column_field::Told;
 use super::column_plan::Terrain;
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
-use super::mask::is_of_water;
+use super::mask::{is_of_air, is_of_water};
 use super::poles::Poles;
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
@@ -57,7 +57,25 @@ impl<'a> Planner<'a> {
             Kind::Level => self.settings.unit("z"),
             _ => None,
         };
-        stated.or_else(|| self.variable(index).units())
+        let own = || self.variable(index).units().filter(|text| !text.is_empty());
+        stated.or_else(own).or_else(|| (kind == Kind::Level && self.are_hectopascals(index)).then_some("hPa"))
+    }
+
+    /// True for levels without a unit on which a variable tells changes of pressure, if their numbers fit (as in ARCO-ERA5).
+    fn are_hectopascals(&self, index: usize) -> bool {
+        let level = self.variable(index);
+        let [dimension] = level.dimensions[..] else { return false };
+        let named = ["level", "lev", "plev", "pressure", "pressure_level", "isobaric"].contains(&level.name.to_ascii_lowercase().as_str());
+        let tells = |v: &Variable| {
+            let unit = v.units().and_then(Unit::parse);
+            v.dimensions.contains(&dimension) && unit.is_some_and(|unit| unit.is_pressure_tendency())
+        };
+        named
+            && level.text("formula_terms").is_none()
+            && self.listing().variables.iter().any(tells)
+            && self
+                .coordinate_values(index)
+                .is_ok_and(|values| values.iter().all(|p| (0.1..=1100.0).contains(p)) && values.iter().any(|p| *p >= 2.0))
     }
 
     /// Names of the dimensions of a variable.
@@ -195,6 +213,7 @@ impl<'a> Planner<'a> {
             why: candidate.why.clone(),
             dimensions: self.dimensions_of(candidate.variable),
             of_water: is_of_water(self.listing(), variable),
+            of_air: is_of_air(variable),
             mask: None,
             columns: None,
             own: Default::default(),
@@ -222,7 +241,13 @@ impl<'a> Planner<'a> {
             Some(u) if quantities.iter().any(|is| is(&u)) => Ok(u.factor),
             Some(u) if u.is_velocity() || u.is_pressure_tendency() => {
                 let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
-                let hint = if component == "w" { ", or ignore vertical motion with --set archive.w=none" } else { "" };
+                let hint = match (component, axis_units.is_empty()) {
+                    ("w", true) => {
+                        ", state the unit of the levels (such as --set archive.units.z=hPa), or ignore vertical motion with --set archive.w=none"
+                    }
+                    ("w", false) => ", or ignore vertical motion with --set archive.w=none",
+                    _ => "",
+                };
                 let what = format!(
                     "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with --set archive.{component}=NAME{hint}"
                 );
@@ -244,7 +269,9 @@ impl<'a> Planner<'a> {
             None => levels.axis.last(),
         });
         let way = level.map_or_else(String::new, |level| {
-            format!("; one level alone is read with --set archive.level={level}, and --set archive.w=continuity computes it")
+            let computed = levels.is_some_and(|levels| levels.quantity == Quantity::Length);
+            let computed = if computed { ", and --set archive.w=continuity computes it" } else { "" };
+            format!("; one level alone is read with --set archive.level={level}{computed}")
         });
         self.note(format!(
             "no vertical velocity found: it is taken as 0, and where levels move apart the FTLE is mostly the shear between them{way}"
@@ -270,7 +297,7 @@ impl<'a> Planner<'a> {
                 self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));
             }
             (None, true) if self.settings.wants_continuity() => self.note(
-                "vertical motion is computed from continuity, as set: 0 at the lowest known node of each column, and above it minus the integral of du/dx + dv/dy",
+                "vertical motion is computed from continuity, as set: 0 at the lowest known node of each column, and above it minus the integral of du/dx + dv/dy (of air, whose density falls with height: exp(-z / 7 km))",
             ),
             (None, true) if self.settings.leaves_out_w() => self.note("vertical motion is ignored, as set"),
             (None, true) => self.note_no_vertical(axis),

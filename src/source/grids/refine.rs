@@ -60,6 +60,9 @@ impl ResamplingError {
 
 impl fmt::Display for ResamplingError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.velocity == 0.0 {
+            return f.write_str("an unknown amount, since nothing moves in the snapshot that was looked at");
+        }
         let percent = |error: f64| 100.0 * error / self.velocity.max(f64::MIN_POSITIVE);
         // Slow flows have more decimals.
         let digits = if self.velocity > 0.0 { (1.0 - self.velocity.log10().floor()).clamp(3.0, 9.0) as usize } else { 3 };
@@ -116,6 +119,13 @@ pub struct Truth {
     places: Target,
     /// At `places`, for each level, by interpolation in the mesh.
     between: Vec<Vectors>,
+}
+
+impl Truth {
+    /// True if some velocity is not 0.
+    pub fn moves(&self) -> bool {
+        self.own.iter().flatten().any(|value| value.is_finite() && *value != 0.0)
+    }
 }
 
 impl Curvilinear {

@@ -60,6 +60,7 @@ impl Planner<'_> {
             factor,
             why: why.into(),
             of_water: false,
+            of_air: false,
             mask: None,
             columns: None,
             own: Default::default(),

@@ -104,13 +104,20 @@ impl Planner<'_> {
         let bare = Unit::parse(units).is_some_and(|unit| unit.is_dimensionless());
         let months = |word: &str| word.starts_with("month");
         let numbers = bare && name.split(|c: char| !c.is_alphabetic()).any(months);
-        if !counted(&first) && !numbers {
+        let days = bare && ["dayofyear", "day_of_year"].contains(&variable.name.to_ascii_lowercase().as_str());
+        if !counted(&first) && !numbers && !days {
             return Ok(());
         }
         let found = if units.is_empty() { "has no unit".into() } else { format!("is in `{units}`") };
+        let (counts, length) = match () {
+            () if days => ("days of a year", "1 day"),
+            () if first.starts_with("year") => ("years, which have no fixed length", "365.2425 days"),
+            () => ("months, which have no fixed length", "30.4375 days"),
+        };
+        let date = units.split_once("since").map_or("2000-01-01", |(_, date)| date.trim());
         Err(self.time_fault(format!(
-            "`{}` counts months or years, which have no fixed length, and {found}: state the length of 1 with --set \
-             archive.units.time=\"30.4375 days\" (a mean month) or, with a date for 0, \"30.4375 days since 2000-01-01\"",
+            "`{}` counts {counts}, and {found}: state the length of 1 with --set archive.units.time=\"{length}\" (the mean) or, with a date for 0, \
+             \"{length} since {date}\"",
             variable.name
         )))
     }

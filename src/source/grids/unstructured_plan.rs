@@ -50,7 +50,22 @@ fn pairs(listing: &Listing) -> Vec<(usize, Pair)> {
     let of = |kind: Kind| listing.matching(move |v: &Variable| v.dimensions.len() == 1 && v.number.is_number() && classify(v) == kind);
     let dimension = |i: usize| listing.variables[i].dimensions[0];
     let partner = |longitude: usize| of(Kind::Latitude).find(|&latitude| dimension(latitude) == dimension(longitude));
-    of(Kind::Longitude).filter_map(|lon| partner(lon).map(|lat| (dimension(lon), [lon, lat]))).collect()
+    let mut found: Vec<(usize, Pair)> =
+        of(Kind::Longitude).filter_map(|lon| partner(lon).map(|lat| (dimension(lon), [lon, lat]))).collect();
+    // Those that a mesh topology of the UGRID conventions names (SCHISM gives them no units).
+    for topology in listing.matching(|v: &Variable| v.text("cf_role") == Some("mesh_topology")) {
+        for names in ["node_coordinates", "face_coordinates"].iter().filter_map(|attribute| listing.variables[topology].text(attribute)) {
+            let pair: Vec<usize> = names.split_whitespace().filter_map(|name| listing.find(name)).collect();
+            if let [lon, lat] = pair[..]
+                && [lon, lat].iter().all(|&i| listing.variables[i].dimensions.len() == 1 && listing.variables[i].units().is_none())
+                && dimension(lon) == dimension(lat)
+                && !found.iter().any(|(known, _)| *known == dimension(lon))
+            {
+                found.push((dimension(lon), [lon, lat]));
+            }
+        }
+    }
+    found
 }
 
 /// True if a file has faces, or longitudes and latitudes along one dimension.
@@ -141,7 +156,8 @@ impl Planner<'_> {
             }
             let own = pair_on(dimension);
             // The dimension of the mesh may have another name in a file of its own.
-            let same_length = |c: &&Connectivity| own.is_some() && length(c.faces) == length(dimension);
+            let is_elsewhere = |c: &Connectivity| self.file.origin(c.variable).0 != self.file.origin(variable).0;
+            let same_length = |c: &&Connectivity| (own.is_some() || is_elsewhere(c)) && length(c.faces) == length(dimension);
             let around =
                 faces.iter().find(|c| c.faces == dimension).or_else(|| faces.iter().find(same_length)).filter(|_| location != "node");
             if own.is_none() && around.is_none() {
@@ -155,7 +171,7 @@ impl Planner<'_> {
                 && nodes_on != dimension
             {
                 let cells = Cells::InFaces { faces: of.variable, nodes };
-                return Ok(Some(Points { pair: own.unwrap_or(nodes), plane: [dimension; 2], between: [false; 2], cells }));
+                return Ok(Some(Points { pair: own.unwrap_or(nodes), plane: [dimension; 2], between: [false; 2], shift: [0; 2], cells }));
             }
             let Some(pair) = own else { continue };
             let metres = |i: &usize| Unit::parse(self.variable(*i).units().unwrap_or_default()).is_some_and(|u| u.is_length());
@@ -169,7 +185,7 @@ impl Planner<'_> {
                     break;
                 }
             }
-            return Ok(Some(Points { pair, plane: [dimension; 2], between: [false; 2], cells }));
+            return Ok(Some(Points { pair, plane: [dimension; 2], between: [false; 2], shift: [0; 2], cells }));
         }
         Ok(None)
     }
