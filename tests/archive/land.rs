@@ -96,6 +96,7 @@ fn numbers_of_levels_that_are_water() {
     }
     assert!(notes(&archive).contains("the number of levels that are water"), "{}", notes(&archive));
     assert_eq!(missing_columns(&[&own], "level = 25.0"), [4, 5, 6, 7]);
+    assert_eq!(missing_columns(&[&own], "level = 25.0\nmask = \"KMU\""), [4, 5, 6, 7]);
     assert_eq!(missing_columns(&[&write("KMT")], "level = 25.0"), [3, 4, 5, 6, 7]);
 }
 

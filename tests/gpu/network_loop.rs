@@ -6,6 +6,7 @@ use super::small;
 use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, GpuSettings, SnapshotStore, Tuning};
 use ridgewatch::backend::{Device, WhenLost};
+use ridgewatch::publish::compare_films;
 use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, ReplayBuffer};
@@ -331,4 +332,41 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
         drop(others);
         assert_eq!(surrogate.checkpoint_async().unwrap().unwrap().wait_reason(), None, "there is room again");
     }
+}
+
+/// A network that is trusted nowhere is traced brick by brick, so that the picture is the same on either.
+#[test]
+#[ignore = "needs a GPU"]
+fn bricks_of_a_network_that_is_not_trusted_are_traced() {
+    let text = scene::scene(
+        "turbulence",
+        [160, 80, 1],
+        "
+        source.nodes = [48, 24, 24]
+        time.tau = 5
+        time.slides = 1
+        time.frames_per_slide = 2
+        flow.steps = 20
+        transfer.low = 0.05
+        transfer.high = 0.3
+        surrogate.kind = \"network\"
+        network.levels = 4
+        network.log2_table = 12
+        network.width = 16
+        training.steps_per_frame = 1
+        trust.tolerance = 1e-6
+        render.method = \"marched\"
+        ",
+    );
+    let [found, expected] =
+        [device(GpuSettings::default()), Device::CPU].map(|device| frames(&text, &[], &RunOptions { device, ..RunOptions::default() }));
+    for (frame, other) in found.iter().zip(&expected) {
+        let traced = [&frame.record, &other.record].map(|record| record.preparation_traces);
+        let psnr = compare_films(&frame.film, &other.film, frame.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
+        measured!("a network that is not trusted, frame {}: {traced:?} nodes and probes traced, {psnr:.1} dB", frame.record.frame);
+        assert!(psnr > 50.0, "{psnr} dB");
+    }
+    // Every node, and what opens the gate.
+    let first = [&found[0].record, &expected[0].record].map(|record| record.preparation_traces);
+    assert!(first[0] == first[1] && first[0] >= 80_000, "{first:?}");
 }

@@ -5,6 +5,7 @@ use crate::network_support::{DoubleGyre, rms, traced, uniform_points};
 use crate::sweep::{grid, lattice, map, row, window};
 use ridgewatch::field::{Domain, Snapshot, Window, WindowWarning};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Precision, VelocitySource};
+use ridgewatch::publish::compare_films;
 use ridgewatch::run::{FrameRecord, RunOptions};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, Samples, SurrogateSettings, build};
@@ -288,4 +289,33 @@ fn too_few_audit_points() {
         &format!("{:.0} points: {:.2} times as wide, {} of {} intervals hold", found[0].1, found[0].2, found[0].3, found[0].4),
         "too_few_audit_points",
     ]);
+}
+
+/// A smooth picture of a network that is trusted nowhere is that of the traced nodes, from the first frame on.
+#[test]
+fn what_a_network_does_not_know_is_traced_for_smooth_pictures() {
+    let text = |keys: &str| {
+        let common = "
+            source.nodes = [24, 12, 12]
+            time.tau = 5
+            time.slides = 1
+            time.frames_per_slide = 1
+            flow.steps = 10
+            transfer.low = 0.05
+            transfer.high = 0.3
+            render.method = \"marched\"
+        ";
+        scene::scene("turbulence", [64, 32, 1], &format!("{common}{keys}"))
+    };
+    let first = |keys: &str| {
+        let mut frames = Vec::new();
+        scene::run_frames(scene::setup(&text(keys), &[]), &RunOptions::default(), |frame| frames.push(frame));
+        frames.remove(0)
+    };
+    let table = first("surrogate.kind = \"table\"\nsurrogate.table_nodes = [24, 12, 12]\n");
+    let keys = "network.levels = 4\nnetwork.log2_table = 12\nnetwork.width = 16\ntraining.steps_per_frame = 1\n";
+    let network = first(&format!("surrogate.kind = \"network\"\ntrust.tolerance = 1e-6\n{keys}"));
+    let psnr = compare_films(&network.film, &table.film, network.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
+    println!("first frame of an untrained network beside a table: {psnr:.1} dB, {} traced before it", network.record.preparation_traces);
+    assert!(psnr > 60.0 && network.record.preparation_traces >= 24 * 12 * 12, "{psnr} dB");
 }

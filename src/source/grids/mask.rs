@@ -76,10 +76,12 @@ impl Water {
     }
 
     /// Of a mask that the settings name.
-    fn of_named(variable: &Variable, opposite: bool) -> Self {
+    fn of_named(variable: &Variable, opposite: bool, which: usize) -> Self {
         let name = variable.name.to_ascii_lowercase();
         match (Self::declared(variable), opposite) {
             (_, true) => Self::Zero,
+            (None, false) if name == "kmu" => Self::Levels { is_around: false },
+            (None, false) if name == "kmt" => Self::Levels { is_around: which < 2 },
             (Some(water), false) => water,
             (None, false) if name.starts_with("land") || name == "lsm" => Self::Little,
             (None, false) => Self::NotZero,
@@ -160,7 +162,7 @@ fn candidate(listing: &Listing, plan: &ComponentPlan, which: usize, settings: &A
         let (rank, water) = match settings.mask.as_deref() {
             Some(named) => {
                 let opposite = named.strip_prefix('!');
-                (variable.name == opposite.unwrap_or(named)).then(|| (0, Water::of_named(variable, opposite.is_some())))?
+                (variable.name == opposite.unwrap_or(named)).then(|| (0, Water::of_named(variable, opposite.is_some(), which)))?
             }
             None => match MODELS.iter().find_map(|names| names.iter().position(|n| *n == name)) {
                 None if name == "kmu" && which < 2 => (0, Water::Levels { is_around: false }),
