@@ -66,7 +66,7 @@ mod tests {
     fn bricks_are_traced_where_the_network_is_not_trusted_the_brightest_first() {
         let shape = [17, 17, 1];
         // Cells of the gate along x: only the last quarter is trusted.
-        let gate = Gate::of([4, 1, 1], vec![false, false, false, true]);
+        let gate = Gate::new([4, 1, 1], vec![false, false, false, true]);
         let mut traced = TracedBricks::default();
         assert!(traced.settle(shape) && !traced.settle(shape));
         assert_eq!(brick_shape(shape), [2, 2, 1]);
@@ -79,7 +79,7 @@ mod tests {
         traced.add(&[1, 3]);
         assert_eq!(next(&traced, 1000), [2, 0]);
         assert_eq!(traced.next(&most, &Gate::uniform(true), |s| s, 1000), [0_u32; 0]);
-        let half = Gate::of([2, 1, 1], vec![true, false]);
+        let half = Gate::new([2, 1, 1], vec![true, false]);
         // The first bricks end at node 7 of 16.
         assert_eq!(TracedBricks { shape, bricks: vec![] }.next(&most, &half, |s| s, 1000), [1, 3]);
         assert!(traced.settle([9, 9, 1]) && traced.bricks().is_empty());

@@ -107,7 +107,7 @@ pub struct Tally {
     pub missing: u64,
     /// Queries in untrusted cells that the surrogate predicted because the tracing budget was spent.
     pub over_budget: u64,
-    /// Nodes of a laid out network that were traced, since it was not trusted there. They are no queries.
+    /// Nodes of a laid out network that were traced, since it was not trusted there, those in missing cells included. They are no queries.
     pub nodes: u64,
     /// Seconds of tracing: wall clock on the CPU, device time on a GPU.
     pub trace_seconds: f64,
@@ -156,9 +156,8 @@ impl<'a> QueryRouter<'a> {
     pub fn trace_nodes(&mut self, points: &[DomainPoint], log_stretch: &mut [f32]) -> Result<(), DeviceError> {
         let Tally { queries, traced, missing, nodes, .. } = self.tally;
         self.route(points, log_stretch, &mut vec![false; points.len()])?;
-        let traced_nodes = self.tally.traced - traced;
         (self.tally.queries, self.tally.traced, self.tally.missing) = (queries, traced, missing);
-        self.tally.nodes = nodes + traced_nodes;
+        self.tally.nodes = nodes + points.len() as u64;
         Ok(())
     }
 

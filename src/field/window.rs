@@ -52,6 +52,15 @@ pub enum WindowWarning {
     },
 }
 
+impl WindowWarning {
+    /// Time of the snapshot.
+    pub fn time(&self) -> f64 {
+        match self {
+            Self::Duplicate { time } | Self::OutOfOrder { time, .. } | Self::MissingBurst { time, .. } => *time,
+        }
+    }
+}
+
 /// Error of adding a snapshot; the window is unchanged.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum WindowFault {

@@ -118,7 +118,9 @@ impl<R: Real> AxisMap<R> {
         } else {
             held = held.max(L::zero()).min(L::splat(self.high));
             let edge = L::splat(R::from_f64(EDGE));
-            let same = (held - state).abs().max(edge).equal(edge);
+            // False for NaN.
+            let beyond = (held - state).abs();
+            let same = beyond.min(edge).equal(beyond);
             if !same.all() {
                 slope = L::select(same, slope, L::zero());
                 scaled = true;

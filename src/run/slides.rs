@@ -194,7 +194,13 @@ impl Slides for ArchiveSlides {
             warnings.extend(news.warnings);
             let newest = window.newest();
             match window.push(snapshot?) {
-                Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
+                Ok(pushed) => warnings.extend(pushed.warning.map(|warning| {
+                    let known = self.dates.iter().find(|(time, _)| *time == warning.time());
+                    match known.and_then(|(_, date)| date.as_ref()) {
+                        Some(date) => format!("{date}: {warning}"),
+                        None => warning.to_string(),
+                    }
+                })),
                 Err(fault) => warnings.push(fault.to_string()),
             }
             *taken += usize::from(window.newest() != newest);

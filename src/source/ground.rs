@@ -11,8 +11,10 @@ use crate::projection::{Jacobian, Projection, difference, turned};
 use rayon::iter::{IntoParallelIterator, ParallelIterator};
 use ridgewatch_field::EARTH_RADIUS;
 
-/// Smallest spacing over which longitudes and latitudes of single precision, a metre apart, tell a scale to a thousandth; metres.
-const LEAST_MEASURED: f64 = 500.0;
+/// Distance over which longitudes and latitudes are compared, metres. Of single precision they are a metre apart.
+const REACH: f64 = 20_000.0;
+/// Metres of a map in a metre on the ground. Others are those of an idealised model, whose longitudes are made up.
+const SCALES: std::ops::RangeInclusive<f64> = 0.2..=6.0;
 
 /// Turns velocities over the ground to the x and y of a grid, and stretches them to its metres.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,14 +52,19 @@ impl GroundToGrid {
         let projection = Self::projection(file, layout, is_plane, known);
         let (xs, ys) = (layout.axes[0].axis.coordinates(), layout.poles.rows_of_file(layout.axes[1].axis.coordinates()));
         let nodes: Vec<[f64; 2]> = ys.iter().flat_map(|&y| xs.iter().map(move |&x| [x, y])).collect();
-        // On finer grids the last digits of longitudes and latitudes would count.
-        let is_measured = is_plane && unit_of_plane(layout).is_some() && (xs[1] - xs[0]).abs().min((ys[1] - ys[0]).abs()) >= LEAST_MEASURED;
-        let is_stretched = is_plane && (projection.is_some() || is_measured);
+        let is_wide = |coordinates: &[f64]| coordinates[coordinates.len() - 1] - coordinates[0] >= REACH;
+        let is_measured = is_plane && unit_of_plane(layout).is_some() && is_wide(xs) && is_wide(ys);
         let jacobians: Option<Vec<Jacobian>> = match (&projection, known) {
             (Some(projection), _) => some_known(nodes.into_par_iter().map(|place| projection.near(place)).collect()),
-            (None, Some(known)) if is_measured => some_known(measured(&known.degrees, xs, ys)),
+            (None, Some(known)) if is_measured => measured(&known.degrees, xs, ys),
             (None, Some(known)) if eastward.is_some() => some_known(rows(&known.degrees, xs.len())),
             (None, _) => None,
+        };
+        // Longitudes and latitudes that are no map's may still tell where east is.
+        let is_stretched = is_plane && jacobians.is_some() && (projection.is_some() || is_measured);
+        let jacobians = match (jacobians, known) {
+            (None, Some(known)) if eastward.is_some() && projection.is_none() => some_known(rows(&known.degrees, xs.len())),
+            (jacobians, _) => jacobians,
         };
         let by = if projection.is_some() { "the grid mapping" } else { "the longitudes and latitudes of the nodes" };
         let scale = |[xe, xn, ye, yn]: &Jacobian| (xe * yn - xn * ye).abs().sqrt();
@@ -160,16 +167,26 @@ fn some_known(found: Vec<Jacobian>) -> Option<Vec<Jacobian>> {
     found.iter().any(|jacobian| jacobian[0].is_finite()).then_some(found)
 }
 
-/// Derivatives at nodes with known longitudes and latitudes, by second-order differences along both axes, whose coordinates are metres.
-fn measured(degrees: &[[f64; 2]], xs: &[f64], ys: &[f64]) -> Vec<Jacobian> {
+/// Derivatives at nodes with known longitudes and latitudes, by second-order differences along both axes, whose coordinates are metres. Differences reach over
+/// [`REACH`], over which no projection changes much, so that the last digits of the longitudes do not count. Where places are missing, derivatives are those of
+/// the nearest node in the row. `None` if the metres are not those of a map.
+fn measured(degrees: &[[f64; 2]], xs: &[f64], ys: &[f64]) -> Option<Vec<Jacobian>> {
     let width = xs.len();
     let along = |here: [f64; 2], n: usize, coordinates: &[f64], place: &dyn Fn(usize) -> [f64; 2]| {
-        let (last, step) = (coordinates.len() - 1, |a: usize, b: usize| coordinates[b] - coordinates[a]);
+        let last = coordinates.len() - 1;
+        let wide = ((REACH / (coordinates[1] - coordinates[0])).ceil() as usize).clamp(1, (last / 2).max(1));
+        let step = |a: usize, b: usize| coordinates[b] - coordinates[a];
         let ends: Vec<(usize, f64)> = match n {
             _ if last < 2 => vec![(last, 1.0 / step(0, last)), (0, -1.0 / step(0, last))],
-            0 => vec![(1, 4.0 / step(0, 2)), (2, -1.0 / step(0, 2)), (0, -3.0 / step(0, 2))],
-            n if n == last => vec![(n - 1, -4.0 / step(n - 2, n)), (n - 2, 1.0 / step(n - 2, n)), (n, 3.0 / step(n - 2, n))],
-            n => vec![(n + 1, 1.0 / step(n - 1, n + 1)), (n - 1, -1.0 / step(n - 1, n + 1))],
+            n if n < wide => {
+                let [near, far] = [n + wide, (n + 2 * wide).min(last)];
+                parabola(step(n, near), step(n, far)).into_iter().zip([n, near, far]).map(|(weight, node)| (node, weight)).collect()
+            }
+            n if n + wide > last => {
+                let [near, far] = [n - wide, n.saturating_sub(2 * wide)];
+                parabola(step(n, near), step(n, far)).into_iter().zip([n, near, far]).map(|(weight, node)| (node, weight)).collect()
+            }
+            n => vec![(n + wide, 1.0 / step(n - wide, n + wide)), (n - wide, -1.0 / step(n - wide, n + wide))],
         };
         let weighted: Vec<([f64; 2], f64)> = ends.into_iter().map(|(node, weight)| (place(node), weight)).collect();
         difference(here, &weighted).map(|share| share * EARTH_RADIUS)
@@ -179,10 +196,32 @@ fn measured(degrees: &[[f64; 2]], xs: &[f64], ys: &[f64]) -> Vec<Jacobian> {
         let [ex, nx] = along(here, i, xs, &|i| degrees[j * width + i]);
         let [ey, ny] = along(here, j, ys, &|j| degrees[j * width + i]);
         let determinant = ex * ny - ey * nx;
-        let found = [ny, -ey, -nx, ex].map(|d| d / determinant);
-        if found.iter().all(|d| d.is_finite()) { found } else { [f64::NAN; 4] }
+        [ny, -ey, -nx, ex].map(|d| d / determinant)
     };
-    (0..degrees.len()).map(at).collect()
+    let mut found: Vec<Jacobian> = (0..degrees.len()).map(at).collect();
+    let is_known = |jacobian: &Jacobian| jacobian.iter().all(|d| d.is_finite());
+    let scale = |jacobian: &Jacobian| (jacobian[0] * jacobian[3] - jacobian[1] * jacobian[2]).abs().sqrt();
+    if !found.iter().any(is_known) || found.iter().filter(|jacobian| is_known(jacobian)).any(|jacobian| !SCALES.contains(&scale(jacobian)))
+    {
+        return None;
+    }
+    for row in found.chunks_mut(width) {
+        let known: Vec<usize> = (0..width).filter(|&i| is_known(&row[i])).collect();
+        for i in 0..width {
+            if let (false, Some(&nearest)) = (is_known(&row[i]), known.iter().min_by_key(|k| k.abs_diff(i))) {
+                row[i] = row[nearest];
+            }
+        }
+    }
+    // Rows without a known node.
+    found.iter_mut().filter(|jacobian| !jacobian.iter().all(|d| d.is_finite())).for_each(|jacobian| *jacobian = [f64::NAN; 4]);
+    Some(found)
+}
+
+/// Weights of the values here and at two signed distances for the derivative of the parabola through them.
+fn parabola(near: f64, far: f64) -> [f64; 3] {
+    let [a, b] = [far / (near * (far - near)), -near / (far * (far - near))];
+    [-a - b, a, b]
 }
 
 /// Turns at nodes with known longitudes and latitudes, by second-order differences along rows of `width`.
@@ -204,6 +243,28 @@ fn rows(degrees: &[[f64; 2]], width: usize) -> Vec<Jacobian> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A plane of single precision, 500 m a cell, and one whose longitudes are made up.
+    #[test]
+    fn scales_are_measured_over_many_cells() {
+        let coordinates: Vec<f64> = (0..121).map(|i| 500.0 * f64::from(i)).collect();
+        let place = |scale: f64, n: usize| {
+            let [x, y] = [coordinates[n % 121], coordinates[n / 121]];
+            let latitude = 60.0 + (y / scale / EARTH_RADIUS).to_degrees();
+            let longitude = 100.0 + (x / scale / EARTH_RADIUS / latitude.to_radians().cos()).to_degrees();
+            [longitude, latitude].map(|angle| f64::from(angle as f32))
+        };
+        let mut degrees: Vec<[f64; 2]> = (0..121 * 121).map(|n| place(1.1, n)).collect();
+        degrees[121 * 40 + 40] = [f64::NAN; 2];
+        let found = measured(&degrees, &coordinates, &coordinates).unwrap();
+        for (n, jacobian) in found.iter().enumerate() {
+            let scale = (jacobian[0] * jacobian[3] - jacobian[1] * jacobian[2]).sqrt();
+            // Two metres in 20 km, and meridians that meet.
+            assert!((scale / 1.1 - 1.0).abs() < 6e-4, "{n}: {scale}");
+        }
+        let made_up: Vec<[f64; 2]> = (0..121 * 121).map(|n| [(n % 121) as f64, 10.0 + (n / 121) as f64 * 0.5]).collect();
+        assert_eq!(measured(&made_up, &coordinates, &coordinates), None);
+    }
 
     #[test]
     fn a_plane_that_is_not_conformal_stretches_its_axes_apart() {

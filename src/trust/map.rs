@@ -250,7 +250,7 @@ impl Gate {
     ///
     /// # Panics
     /// If the number of cells differs.
-    pub fn of(shape: [usize; 3], trusted: Vec<bool>) -> Self {
+    pub fn new(shape: [usize; 3], trusted: Vec<bool>) -> Self {
         assert_eq!(trusted.len(), shape.iter().product::<usize>(), "one entry a cell");
         Self { shape, trusted }
     }

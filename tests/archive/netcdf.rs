@@ -8,6 +8,38 @@ use ridgewatch::source::{ArchiveSettings, FileOrder, Metric, SnapshotSource, ins
 use std::path::PathBuf;
 use tempfile::tempdir;
 
+/// ARCO-ERA5: pressures without a unit, known by omega. Numbers of a model's levels are none.
+#[test]
+fn levels_without_a_unit_are_pressures_if_their_numbers_are() {
+    let dir = tempdir().unwrap();
+    let write = |name: &str, levels: &[f64], long_name: &str| {
+        let axes: [(&str, &str, &[f64]); 4] = [
+            ("time", HOURS, &[0.0, 6.0]),
+            ("level", "", levels),
+            ("latitude", "degrees_north", &[41.0, 40.0]),
+            ("longitude", "degrees_east", &[10.0, 11.0, 12.0]),
+        ];
+        let mut fixture = Fixture::on(NETCDF4, &axes);
+        fixture.variables.iter_mut().filter(|v| v.name == "level").for_each(|v| v.attributes.push(("long_name".into(), long_name.into())));
+        let count = 2 * levels.len() * 6;
+        fixture = fixture.fields("m s**-1", [("u", f32s(vec![5.0; count])), ("v", f32s(vec![1.0; count]))]);
+        fixture
+            .fields("Pa s**-1", [("vertical_velocity", f32s(vec![-0.5; count]))])
+            .with("standard_name", "lagrangian_tendency_of_air_pressure")
+            .write(&dir.path().join(name))
+    };
+    let archive = open(&[write("arco.nc", &[300.0, 500.0, 850.0], "")]);
+    assert!((archive.grid().axes[2].coordinates()[0] + 7000.0 * 0.85f64.ln()).abs() < 1e-6);
+    let numbers: Vec<f64> = (1..=20).map(f64::from).collect();
+    for (name, levels, long_name) in [("ml.nc", &numbers[..], ""), ("named.nc", &[10.0, 50.0, 100.0], "model_level_number")] {
+        refused(
+            &[write(name, levels, long_name)],
+            "",
+            &["`vertical_velocity`", "does not fit the axis `level`", "--set archive.units.z=hPa"],
+        );
+    }
+}
+
 #[test]
 fn every_format_gives_the_same_snapshots() {
     let dir = tempdir().unwrap();

@@ -275,7 +275,7 @@ impl Archive {
         archive.refine(settings)?;
         if let Some(error) = archive.resampling_error()? {
             let notes = &mut archive.description.notes;
-            notes.push(format!("resampling error, measured on the first snapshot, root mean square: {error}"));
+            notes.push(format!("resampling error, measured on one snapshot, root mean square: {error}"));
             notes.extend(archive.resampling.as_ref().and_then(|resampling| resampling.warning(&error)));
         }
         Ok(archive)

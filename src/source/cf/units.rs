@@ -22,7 +22,8 @@ fn base(name: &str) -> Option<Unit> {
     let pressure = |factor| Unit { factor, powers: [0, 0, 1] };
     let velocity = |factor| Unit { factor, powers: [1, -1, 0] };
     Some(match name.to_ascii_lowercase().as_str() {
-        "m" | "meter" | "meters" | "metre" | "metres" => length(1.0),
+        // Geopotential metres too.
+        "m" | "meter" | "meters" | "metre" | "metres" | "gpm" => length(1.0),
         "km" | "kilometer" | "kilometers" | "kilometre" | "kilometres" => length(1e3),
         "cm" | "centimeter" | "centimeters" | "centimetre" | "centimetres" => length(1e-2),
         "mm" | "millimeter" | "millimeters" | "millimetre" | "millimetres" => length(1e-3),

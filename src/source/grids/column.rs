@@ -161,8 +161,12 @@ impl Columns {
         let mut descends = false;
         for k in (0..self.order.len()).filter(|&k| height(k).is_finite()) {
             match known.last() {
-                // Layers may vanish.
-                Some(&below) if is_field && height(k) <= height(below) => descends |= height(k) < height(below),
+                Some(&below) if is_field && height(k) < height(below) => descends = true,
+                // Of layers that vanish the last one lies beside the next that does not.
+                Some(&below) if is_field && height(k) == height(below) => {
+                    known.pop();
+                    known.push(k);
+                }
                 _ => known.push(k),
             }
         }
@@ -171,11 +175,11 @@ impl Columns {
     }
 
     /// Error of interpolation between the heights of the grid, at the levels of components of the first time, and the share of their values that lie below or
-    /// above the heights, or beside one where nothing is known. In archives of many columns, some rows of them are read.
+    /// above the heights, or beside one where nothing is known; `None` if none could be compared. In archives of many columns, some rows of them are read.
     ///
     /// # Errors
     /// The values cannot be read.
-    pub fn error(file: &DataFile, components: &[ComponentPlan]) -> Result<(ResamplingError, f64), SourceError> {
+    pub fn error(file: &DataFile, components: &[ComponentPlan]) -> Result<(Option<ResamplingError>, f64), SourceError> {
         let (mut sums, mut outside, mut all) = (SquaredErrors::default(), 0u64, 0u64);
         for component in components {
             let Some(columns) = &component.columns else { continue };
@@ -199,7 +203,8 @@ impl Columns {
                 }
             }
         }
-        Ok((ResamplingError::at_points(sums.root_mean_squares()), outside as f64 / all.max(1) as f64))
+        let error = (outside < all).then(|| ResamplingError::at_points(sums.root_mean_squares()));
+        Ok((error, outside as f64 / all.max(1) as f64))
     }
 
     /// Heights of all levels over the points of a component, and the lower and upper end of each column, metres.

@@ -61,8 +61,8 @@ impl Planner<'_> {
         }
         let names = self.variable(variable).text("coordinates")?;
         // Levels whose kind of height is named may be told by other fields of this kind.
-        let tells = |unit: Unit| unit.is_length() || (named.is_some() && (unit.is_geopotential() || unit.is_pressure()));
-        names.split_whitespace().filter_map(|name| self.listing().find(name)).filter(along).find(|&i| unit(i).is_some_and(tells))
+        let is_height = |unit: Unit| unit.is_length() || (named.is_some() && (unit.is_geopotential() || unit.is_pressure()));
+        names.split_whitespace().filter_map(|name| self.listing().find(name)).filter(along).find(|&i| unit(i).is_some_and(is_height))
     }
 
     /// Levels whose heights a field tells.
@@ -73,12 +73,12 @@ impl Planner<'_> {
         let told = match self.fields_of_heights.iter().find(|(known, _)| *known == field) {
             Some((_, told)) => *told,
             None => {
-                let told = self.what_tells(field, &heights, is_of_water(self.listing(), self.variable(of)))?;
+                let told = self.height_field(field, &heights, is_of_water(self.listing(), self.variable(of)))?;
                 self.fields_of_heights.push((field, told));
                 told
             }
         };
-        let Told { factor, is_pressure, ascends, is_of_air } = told;
+        let HeightField { factor, is_pressure, ascends, is_of_air } = told;
         heights.factor = factor;
         let count = heights.along(2);
         let order = if ascends { (0..count).collect() } else { (0..count).rev().collect() };
@@ -91,7 +91,7 @@ impl Planner<'_> {
     }
 
     /// Reads the first time of a field, to know what it tells.
-    fn what_tells(&mut self, field: usize, heights: &ComponentPlan, is_of_water: bool) -> Result<Told, SourceError> {
+    fn height_field(&mut self, field: usize, heights: &ComponentPlan, is_of_water: bool) -> Result<HeightField, SourceError> {
         let (factor, is_pressure) = match self.axis_units(Kind::Level, field) {
             None => {
                 self.note(format!("`{}` has no unit: taken as metres", heights.name));
@@ -143,7 +143,7 @@ impl Planner<'_> {
             return Err(self.misfit(field, what));
         }
         if is_pressure {
-            return Ok(Told { factor, is_pressure, ascends: shrinks, is_of_air: true });
+            return Ok(HeightField { factor, is_pressure, ascends: shrinks, is_of_air: true });
         }
         let variable = self.variable(field);
         let says_depth = |text: &str| text.to_ascii_lowercase().contains("dep");
@@ -153,7 +153,7 @@ impl Planner<'_> {
             _ => (says_depth(&variable.name) || variable.text("standard_name").is_some_and(says_depth) || is_of_water) && sum > 0.0,
         };
         let sign = if is_down { -1.0 } else { 1.0 };
-        Ok(Told { factor: sign * factor, is_pressure, ascends: grows != is_down, is_of_air: sign * sum > 0.0 })
+        Ok(HeightField { factor: sign * factor, is_pressure, ascends: grows != is_down, is_of_air: sign * sum > 0.0 })
     }
 }
 
@@ -165,7 +165,7 @@ fn is_scale_factor(name: &str) -> bool {
 
 /// What a field tells of its levels.
 #[derive(Debug, Clone, Copy)]
-pub struct Told {
+pub struct HeightField {
     /// To heights in metres, or pressures in Pa.
     factor: f64,
     is_pressure: bool,

@@ -31,6 +31,9 @@ const PRESSURES: [f64; 2] = [2e4, 1.5e5];
 /// Names of ROMS and CROCO, for levels of tracers and those between them: s, C(s).
 const NAMES: [[&[&str]; 2]; 2] = [[&["s_rho", "sc_r"], &["Cs_r", "Cs_rho"]], [&["s_w", "sc_w"], &["Cs_w"]]];
 
+/// Share of the values outside of the heights of the grid above which there is a warning.
+const MUCH_OUTSIDE: f64 = 0.5;
+
 impl Terrain {
     /// True along the levels of component `which` (0, 1, 2 for u, v, w).
     pub fn is_along(&self, which: usize, dimension: usize) -> bool {
@@ -271,13 +274,13 @@ impl Planner<'_> {
         }
         if is_first && terrain.is_some_and(Terrain::is_three) {
             let (error, outside) = Columns::error(self.file, &components[..2])?;
-            let told = format!(
-                "interpolation between these heights errs by {error}, at the first time; {:.1} % of the file's values lie above or below them, or beside a \
-                 missing one",
-                100.0 * outside
-            );
-            self.note(match error.excess() > LARGE {
-                true => format!("WARNING: {told}: --set archive.heights=[...] names more, where the flow changes most"),
+            let told = match error {
+                Some(error) => format!("interpolation between these heights errs by {error}, at the first time"),
+                None => "interpolation between these heights could not be measured at the first time".into(),
+            };
+            let told = format!("{told}; {:.1} % of the file's values lie above or below them, or beside a missing one", 100.0 * outside);
+            self.note(match outside > MUCH_OUTSIDE || error.is_some_and(|error| error.excess() > LARGE) {
+                true => format!("WARNING: {told}: --set archive.heights=[...] names others, more where the flow changes most"),
                 false => told,
             });
         }
@@ -483,7 +486,11 @@ impl Planner<'_> {
         let (Some(ground), false) = (self.listing().find("PS").or(self.listing().find("ps")), self.counts_cells()) else { return Ok(None) };
         let unit = self.listing().find("P0").and_then(|index| Unit::parse(self.variable(index).units()?)).filter(Unit::is_pressure);
         let reference = self.scalar(&["P0"])?.map_or(REFERENCE_PRESSURE, |p| p * unit.map_or(1.0, |unit| unit.factor));
-        let levels = a.into_iter().zip(b).map(|(a, b)| [a * reference, b]).collect();
+        // ECHAM and CDO write pressures under the same name.
+        let unit = self.listing().find("hyam").and_then(|index| Unit::parse(self.variable(index).units()?)).filter(Unit::is_pressure);
+        let is_share = unit.is_none() && a.iter().all(|a| a.abs() <= 1.0);
+        let factor = if is_share { reference } else { unit.map_or(1.0, |unit| unit.factor) };
+        let levels = a.into_iter().zip(b).map(|(a, b)| [a * factor, b]).collect();
         Ok(Some(Terms { formula: Formula::Hybrid, levels, critical_depth: 0.0, ground, surface: None }))
     }
 

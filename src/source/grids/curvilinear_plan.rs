@@ -46,6 +46,11 @@ pub enum Cells {
     InFaces { faces: usize, nodes: Pair },
 }
 
+/// Ends of the names of dimensions of faces, whose centres have the name without it, and how many half cells they lie from these.
+const FACES: [(&str, i8); 3] = [("_g", -1), ("_left", -1), ("_right", 1)];
+/// Levels of u and v that differ by this share are the same.
+const SAME_LEVEL: f64 = 1e-3;
+
 /// Bytes of a point of a mesh: coordinates, directions, and up to four nodes with their places, bases and velocities.
 pub const POINT_BYTES: u64 = 500;
 
@@ -169,7 +174,9 @@ impl Planner<'_> {
             let between = more.map(|more| more == 1);
             let same_part = self.file.origin(lon).0 == self.file.origin(variable).0;
             let shift = [0, 1].map(|k| match (self.plane_of(lon)[k], [x, y][k]) {
-                (of_pair, own) if same_part && more[k] == 0 && of_pair != own => self.face_shift(own) - self.face_shift(of_pair),
+                (of_pair, own) if same_part && more[k] == 0 && of_pair != own => {
+                    (self.face_shift(own) - self.face_shift(of_pair)).clamp(-1, 1)
+                }
                 _ => 0,
             });
             (more.iter().all(|more| (0..=1).contains(more))).then_some(Points {
@@ -200,9 +207,10 @@ impl Planner<'_> {
         let stated = of.and_then(|index| self.variable(index).numbers("c_grid_axis_shift").first().copied());
         match stated {
             Some(shift) if shift != 0.0 => shift.signum() as i8,
-            _ if name.ends_with("_g") || name.ends_with("_left") => -1,
-            _ if name.ends_with("_right") => 1,
-            _ => 0,
+            _ => FACES
+                .iter()
+                .find(|(end, _)| name.strip_suffix(end).is_some_and(|centre| self.listing().dimensions.iter().any(|d| d.name == centre)))
+                .map_or(0, |(_, shift)| *shift),
         }
     }
 
@@ -433,9 +441,12 @@ impl Planner<'_> {
         if of_u == of_v {
             return Ok(());
         }
-        let [here, there] = [self.coordinate_values(of_u)?, self.coordinate_values(of_v)?];
-        let scale = here.iter().fold(0.0f64, |most, value| most.max(value.abs()));
-        match here.iter().zip(&there).position(|(a, b)| (a - b).abs() > 1e-4 * scale) {
+        let values = |index: usize| {
+            let factor = self.axis_units(Kind::Level, index).and_then(Unit::parse).map_or(1.0, |unit| unit.factor);
+            Ok::<Vec<f64>, SourceError>(self.coordinate_values(index)?.into_iter().map(|value| factor * value).collect())
+        };
+        let [here, there] = [values(of_u)?, values(of_v)?];
+        match here.iter().zip(&there).position(|(a, b)| (a - b).abs() > SAME_LEVEL * a.abs().max(b.abs())) {
             None => Ok(()),
             Some(k) => {
                 let name = &self.variable(u).name;
@@ -448,29 +459,27 @@ impl Planner<'_> {
         }
     }
 
-    /// Refuses points of v that are not those beside the points of u.
-    fn check_beside(&self, points: &[Points], meshes: &[Arc<Mesh>]) -> Result<(), SourceError> {
-        let ([u, v], Cells::Rows) = ([&meshes[0], &meshes[1]], points[0].cells) else { return Ok(()) };
-        let names = [0, 1].map(|k| &self.variable(points[k].pair[0]).name);
-        let fault = |what: String| Err(self.misfit(points[1].pair[0], format!("{what}: accepted are components of one mesh")));
-        if (0..2).any(|k| u.shape[k].abs_diff(v.shape[k]) > 1) {
-            return fault(format!("v has {} x {} points, u (`{}`) {} x {}", v.shape[0], v.shape[1], names[0], u.shape[0], u.shape[1]));
-        }
-        let [nx, ny] = [0, 1].map(|k| u.shape[k].min(v.shape[k]));
-        let apart = |a: [f64; 2], b: [f64; 2]| {
-            let east = (b[0] - a[0] + 180.0).rem_euclid(360.0) - 180.0;
-            (east * a[1].to_radians().cos()).hypot(b[1] - a[1])
+    /// Refuses points of v that lie elsewhere than those of u altogether.
+    fn check_overlap(&self, points: &[Points], meshes: &[Arc<Mesh>]) -> Result<(), SourceError> {
+        let [u, v] = [&meshes[0], &meshes[1]];
+        // From the first known point of u, so that a box may cross any meridian.
+        let known = |mesh: &Mesh| (0..mesh.longitude.len()).filter_map(|n| mesh.place(n)).collect::<Vec<_>>();
+        let [of_u, of_v] = [known(u), known(v)];
+        let Some(&[origin, _]) = of_u.first() else { return Ok(()) };
+        let range = |places: &[[f64; 2]]| {
+            places.iter().fold([[f64::INFINITY, f64::NEG_INFINITY]; 2], |box_, place| {
+                let place = [(place[0] - origin + 180.0).rem_euclid(360.0) - 180.0, place[1]];
+                [0, 1].map(|k| [box_[k][0].min(place[k]), box_[k][1].max(place[k])])
+            })
         };
-        let known = (0..ny).flat_map(|j| (0..nx.saturating_sub(1)).map(move |i| (i, j))).find_map(|(i, j)| {
-            let (here, next, there) = (u.point(i, j)?, u.point(i + 1, j)?, v.point(i, j)?);
-            Some(([i, j], here, there, apart(here, there), apart(here, next)))
-        });
-        match known {
-            Some((place, here, there, distance, spacing)) if distance > 4.0 * spacing.max(1e-6) => {
-                fault(format!("at {place:?} v lies at {there:.3?} degrees, u (`{}`) at {here:.3?}", names[0]))
-            }
-            _ => Ok(()),
+        let [a, b] = [range(&of_u), range(&of_v)];
+        if of_v.is_empty() || (0..2).all(|k| a[k][0] <= b[k][1] && b[k][0] <= a[k][1]) {
+            return Ok(());
         }
+        let shown =
+            |r: [[f64; 2]; 2]| format!("{:.2} to {:.2} east, {:.2} to {:.2} north", r[0][0] + origin, r[0][1] + origin, r[1][0], r[1][1]);
+        let what = format!("v lies at {}, u at {}: accepted are components of one place", shown(b), shown(a));
+        Err(self.misfit(points[1].pair[0], what))
     }
 
     /// Makes the grid, at the mesh's own spacing unless one is set, and locates its nodes among the points of each component.
@@ -481,7 +490,7 @@ impl Planner<'_> {
             let twin = points[..k].iter().position(|other| other == own);
             meshes.push(twin.map_or_else(|| self.mesh(own).map(Arc::new), |twin| Ok(meshes[twin].clone()))?);
         }
-        self.check_beside(points, &meshes)?;
+        self.check_overlap(points, &meshes)?;
         let resolution = self.settings.resolution;
         let target = target(&meshes[0], resolution, self.settings.region).map_err(|what| self.misfit(points[0].pair[0], what))?;
         let (along, why) = self.runs_along_grid(u, points[0].cells);

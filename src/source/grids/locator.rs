@@ -169,9 +169,13 @@ impl Mesh {
         self
     }
 
-    pub fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
-        let n = j * self.shape[0] + i;
+    /// Longitude and latitude of point `n`; `None` if they are missing.
+    pub fn place(&self, n: usize) -> Option<[f64; 2]> {
         (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])
+    }
+
+    pub fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
+        self.place(j * self.shape[0] + i)
     }
 
     /// Degrees between neighbouring points: along x, or along all sides of triangles.

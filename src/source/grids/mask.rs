@@ -228,7 +228,13 @@ impl Masks {
             if self.found[which].as_ref().is_some_and(|(rank, _)| *rank <= best.rank) {
                 continue;
             }
-            let mask = read(file, &best, plan)?;
+            let Some(mask) = read(file, &best, plan)? else {
+                self.notes.push(format!(
+                    "WARNING: `{}` counts the levels that are water, but `{}` holds only some of these levels: it is not used",
+                    listing.variables[best.variable].name, plan.name
+                ));
+                continue;
+            };
             let share = 100.0 * mask.share();
             used.push((best.variable, format!("{share:.1} % of `{}` by `{}` ({})", plan.name, mask.name, best.water.described())));
             self.found[which] = Some((best.rank, Arc::new(mask)));
@@ -259,7 +265,8 @@ impl Masks {
     }
 }
 
-fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<Mask, SourceError> {
+/// `None` if it counts levels, but which ones the file holds is not known.
+fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<Option<Mask>, SourceError> {
     let variable = &file.listing.variables[candidate.variable];
     let packing = Packing::of(variable).map_err(|what| SourceError::variable(&file.listing.path, &variable.name, what))?;
     let lengths = file.listing.shape(variable);
@@ -269,10 +276,6 @@ fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<
     };
     let (start, count): (Vec<usize>, Vec<usize>) = candidate.along.iter().zip(&lengths).map(part).unzip();
     let values: Vec<f64> = file.read(candidate.variable, start, count.clone())?.into_iter().map(|v| packing.unpack(v)).collect();
-    if let Water::Levels { is_around } = candidate.water {
-        return Ok(Mask::new(&variable.name, [plan.along(0), plan.along(1), plan.along(2)], below_bottom(&values, plan, is_around)));
-    }
-    let water: Vec<bool> = values.into_iter().map(|value| candidate.water.holds(value)).collect();
     // Extent and distance between neighbours along each axis of the grid.
     let (mut extent, mut strides, mut stride) = ([1usize; 3], [0usize; 3], 1);
     for (along, &n) in candidate.along.iter().zip(&count).rev() {
@@ -281,6 +284,23 @@ fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<
         }
         stride *= n;
     }
+    if let Water::Levels { is_around } = candidate.water {
+        let at = |x: usize, y: usize| {
+            let value = values[y.min(extent[1] - 1) * strides[1] + x.min(extent[0] - 1) * strides[0]];
+            if value.is_finite() { value } else { 0.0 }
+        };
+        return Ok(below_bottom(&values, plan).map(|level| {
+            let least = |x: usize, y: usize| match is_around || extent[0] > plan.along(0) || extent[1] > plan.along(1) {
+                true => at(x, y).min(at(x + 1, y)).min(at(x, y + 1)).min(at(x + 1, y + 1)),
+                false => at(x, y),
+            };
+            let shape = [0, 1, 2].map(|k| plan.along(k));
+            let land =
+                (0..shape.iter().product()).map(|n| least(n % shape[0], n / shape[0] % shape[1]) <= level(n / (shape[0] * shape[1])));
+            Mask::new(&variable.name, shape, land.collect())
+        }));
+    }
+    let water: Vec<bool> = values.into_iter().map(|value| candidate.water.holds(value)).collect();
     let shape = [0, 1, 2].map(|k| if extent[k] == 1 { 1 } else { plan.along(k) });
     // A face is water if the points on both sides are.
     let reach = |k: usize| if extent[k] > shape[k] { 2 } else { 1 };
@@ -293,32 +313,26 @@ fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<
             }
         }
     }
-    Ok(Mask::new(&variable.name, shape, land))
+    Ok(Some(Mask::new(&variable.name, shape, land)))
 }
 
-/// Points of a component that are land or rock, by the numbers of levels that are water in its columns (x fastest), or in the columns around its points.
-fn below_bottom(levels: &[f64], plan: &ComponentPlan, is_around: bool) -> Vec<bool> {
-    let [nx, ny, nz] = [0, 1, 2].map(|k| plan.along(k));
-    // The one level that is read, of those that the columns count.
-    let most = levels.iter().copied().filter(|n| n.is_finite()).fold(0.0, f64::max);
-    let fixed = plan.roles.iter().zip(&plan.shape).find_map(|(role, &len)| match role {
-        Role::Fixed(entry) if len > 1 && len as f64 >= most => Some(*entry),
-        _ => None,
+/// Number in the file, from the surface, of each level that a component is read on. `None` if the file does not have all the levels that `counts` reach to:
+/// which of them it holds is then not known.
+fn below_bottom(counts: &[f64], plan: &ComponentPlan) -> Option<impl Fn(usize) -> f64 + use<>> {
+    let most = counts.iter().copied().filter(|n| n.is_finite()).fold(0.0, f64::max);
+    let is_level = |name: &str| classify_name(name) == Kind::Level || name.to_ascii_lowercase().starts_with("z_");
+    let place = (0..plan.roles.len()).find(|&i| match plan.roles[i] {
+        Role::Axis(2) => true,
+        Role::Fixed(_) => is_level(&plan.dimensions[i]),
+        _ => false,
     });
-    let wet = |x: usize, y: usize| levels.get(y * nx + x).copied().filter(|n| n.is_finite()).unwrap_or(0.0);
-    let around = |x: usize, y: usize| match is_around {
-        true => [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)]
-            .iter()
-            .map(|&(x, y)| wet(x.min(nx - 1), y.min(ny - 1)))
-            .fold(f64::INFINITY, f64::min),
-        false => wet(x, y),
+    let fixed = match place.map(|i| (plan.roles[i], plan.shape[i])) {
+        Some((_, len)) if (len as f64) < most => return None,
+        Some((Role::Fixed(entry), _)) => entry,
+        // The surface, without levels.
+        _ => 0,
     };
-    let mut land = Vec::with_capacity(nx * ny * nz);
-    for z in 0..nz {
-        let level = if nz == 1 { fixed.unwrap_or(0) } else { z };
-        land.extend((0..nx * ny).map(|n| around(n % nx, n / nx) <= level as f64));
-    }
-    land
+    Some(move |level: usize| (fixed + level) as f64)
 }
 
 /// Standard name and long name, in small letters.
@@ -327,10 +341,16 @@ fn words_of(variable: &Variable) -> String {
     format!("{} {}", of("standard_name"), of("long_name"))
 }
 
-/// True if a velocity is of air, as far as its names say.
+/// True if a velocity is of air, as far as its names say: its standard name, else a word of its long name.
 pub fn is_of_air(variable: &Variable) -> bool {
+    let standard = variable.text("standard_name").unwrap_or_default().to_ascii_lowercase();
+    let says = |words: &[&str]| words.iter().any(|word| standard.contains(word));
+    if says(&["sea_", "ocean", "water"]) {
+        return false;
+    }
     let words = words_of(variable);
-    ["wind", "air", "atmos"].iter().any(|part| words.contains(part))
+    let mut words = words.split(|c: char| !c.is_alphanumeric());
+    says(&["wind", "air"]) || words.any(|word| ["wind", "winds", "air", "atmosphere", "atmospheric"].contains(&word))
 }
 
 /// True if a velocity is of water, as far as its names say.

@@ -1,7 +1,7 @@
 //! The planner of one file, and what all plans share.
 
 use super::axes::{AxisPlan, Quantity};
-use super::column_field::Told;
+use super::column_field::HeightField;
 use super::column_plan::Terrain;
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
@@ -17,6 +17,12 @@ use crate::formats::{DataFile, Listing, UNREADABLE, Variable};
 use std::fmt::Display;
 use std::path::Path;
 
+/// Levels of analyses, hPa.
+const STANDARD_PRESSURES: [f64; 37] = [
+    1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 30.0, 50.0, 70.0, 100.0, 125.0, 150.0, 175.0, 200.0, 225.0, 250.0, 300.0, 350.0, 400.0, 450.0,
+    500.0, 550.0, 600.0, 650.0, 700.0, 750.0, 775.0, 800.0, 825.0, 850.0, 875.0, 900.0, 925.0, 950.0, 975.0, 1000.0,
+];
+
 /// Plans one file.
 pub struct Planner<'a> {
     pub file: &'a DataFile,
@@ -24,7 +30,7 @@ pub struct Planner<'a> {
     /// See [`super::layout::Layout::notes`].
     pub notes: Vec<String>,
     /// Fields of heights that were looked at, by their variable.
-    pub fields_of_heights: Vec<(usize, Told)>,
+    pub fields_of_heights: Vec<(usize, HeightField)>,
 }
 
 impl<'a> Planner<'a> {
@@ -70,12 +76,18 @@ impl<'a> Planner<'a> {
             let unit = v.units().and_then(Unit::parse);
             v.dimensions.contains(&dimension) && unit.is_some_and(|unit| unit.is_pressure_tendency())
         };
-        named
-            && level.text("formula_terms").is_none()
-            && self.listing().variables.iter().any(tells)
-            && self
-                .coordinate_values(index)
-                .is_ok_and(|values| values.iter().all(|p| (0.1..=1100.0).contains(p)) && values.iter().any(|p| *p >= 2.0))
+        // Numbers of a model's levels are no pressures.
+        let words =
+            ["long_name", "standard_name", "description"].map(|name| level.text(name).unwrap_or_default()).concat().to_ascii_lowercase();
+        let is_of_model = ["model", "hybrid", "sigma", "eta", "number"].iter().any(|word| words.contains(word))
+            || level.text("formula_terms").is_some()
+            || ["hyam", "hybm", "lnsp", "ap", "hyai"].iter().any(|name| self.listing().find(name).is_some());
+        let are_pressures = |values: Vec<f64>| {
+            let standard = |p: &f64| STANDARD_PRESSURES.contains(p);
+            2 * values.iter().filter(|p| standard(p)).count() > values.len()
+                && values.windows(2).any(|pair| (pair[1] - pair[0]).abs() != 1.0)
+        };
+        named && !is_of_model && self.listing().variables.iter().any(tells) && self.coordinate_values(index).is_ok_and(are_pressures)
     }
 
     /// Names of the dimensions of a variable.
@@ -266,6 +278,8 @@ impl<'a> Planner<'a> {
         let level = levels.map(|levels| match &levels.in_file {
             Some(ends) if ends.last.abs() < ends.first.abs() => ends.last,
             Some(ends) => ends.first,
+            // Heights that columns are interpolated to, of which any number may be read: in the sea the highest, above the ground the lowest one.
+            None if levels.axis.last() > 0.0 => levels.axis.first().round(),
             None => levels.axis.last(),
         });
         let way = level.map_or_else(String::new, |level| {
@@ -297,7 +311,7 @@ impl<'a> Planner<'a> {
                 self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));
             }
             (None, true) if self.settings.wants_continuity() => self.note(
-                "vertical motion is computed from continuity, as set: 0 at the lowest known node of each column, and above it minus the integral of du/dx + dv/dy (of air, whose density falls with height: exp(-z / 7 km))",
+                "vertical motion is computed from continuity, as set: 0 at the lowest known node of each column, and above it minus the integral of du/dx + dv/dy; the density falls as exp(-z / 7 km) if names say wind or air",
             ),
             (None, true) if self.settings.leaves_out_w() => self.note("vertical motion is ignored, as set"),
             (None, true) => self.note_no_vertical(axis),

@@ -116,7 +116,7 @@ impl Planner<'_> {
         };
         let date = units.split_once("since").map_or("2000-01-01", |(_, date)| date.trim());
         Err(self.time_fault(format!(
-            "`{}` counts {counts}, and {found}: state the length of 1 with --set archive.units.time=\"{length}\" (the mean) or, with a date for 0, \
+            "`{}` counts {counts}, and {found}: state the length of 1 with --set archive.units.time=\"{length}\" or, with a date for 0, \
              \"{length} since {date}\"",
             variable.name
         )))
@@ -148,7 +148,7 @@ impl Planner<'_> {
             None => Ok(()),
             Some(i) => {
                 let (before, here) = (show(i - 1), show(i));
-                Err(self.time_fault(format!("entry {i} of `{name}` is {here}, the one before it {before}; times must ascend")))
+                Err(self.time_fault(format!("entry {i} of `{name}` is {here}, the one before it {before}; times must ascend (`cdo mergetime` or xarray's `sortby` orders them)")))
             }
         }
     }

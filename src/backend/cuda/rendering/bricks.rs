@@ -6,11 +6,13 @@ use crate::TracedBricks;
 use crate::cuda::network::UnitBoxArgument;
 use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
+use ridgewatch_base::progress;
 use ridgewatch_field::Domain;
 use ridgewatch_render::Renderer;
 use ridgewatch_render::smooth::{brick_shape, own_nodes};
 use ridgewatch_trust::Gate;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Bricks that are traced at once: their points, values and marks take at most 200 MB.
 const AT_ONCE: usize = 1 << 14;
@@ -45,6 +47,8 @@ pub(super) struct Wanted<'a> {
     pub(super) gate: &'a Gate,
     /// Most nodes.
     pub(super) most: usize,
+    /// Setting it ends the tracing early; the frame is then of no use.
+    pub(super) stop: &'a AtomicBool,
 }
 
 impl DeviceBricks {
@@ -84,7 +88,8 @@ impl DeviceBricks {
         self.batches.iter().try_for_each(|batch| self.write(nodes, batch))?;
         let next = self.traced.next(&self.largest(nodes)?, wanted.gate, |s| renderer.ramp(s), wanted.most);
         let mut count = 0;
-        for bricks in next.chunks(AT_ONCE) {
+        for bricks in next.chunks(AT_ONCE).take_while(|_| !wanted.stop.load(Ordering::Relaxed)) {
+            progress::mark();
             let batch = self.trace(nodes, bricks, wanted.domain, answers)?;
             self.write(nodes, &batch)?;
             count += batch.values.len() as u64;

@@ -37,7 +37,7 @@ pub(in crate::cuda) struct GpuSmooth {
     march: GpuMarch,
     nodes: DeviceNodes,
     /// Nodes of a network that were traced, since it was not trusted there, and how many of them in this frame.
-    bricks: DeviceBricks,
+    bricks: Option<DeviceBricks>,
     traced_nodes: u64,
     tracker: CoupledTracker,
     combine: GpuCombine,
@@ -87,7 +87,7 @@ impl GpuSmooth {
         Ok(Self {
             march: GpuMarch::new(gpu)?,
             nodes: DeviceNodes::new(gpu)?,
-            bricks: DeviceBricks::new(gpu)?,
+            bricks: None,
             traced_nodes: 0,
             tracker: CoupledTracker::new(gpu)?,
             combine: GpuCombine::new(gpu)?,
@@ -119,8 +119,12 @@ impl GpuSmooth {
             let domain = round.tracer.host().domain();
             self.nodes.lay_out(round.predictor, round.smooth.nodes, domain.dimensions)?;
             if round.smooth.traced_nodes > 0 {
-                let wanted = Wanted { window: round.window, domain, gate: round.gate, most: round.smooth.traced_nodes };
-                self.traced_nodes = self.bricks.fill(node_grid(&self.nodes, round)?, renderer, &wanted, answers)?;
+                let wanted = Wanted { window: round.window, domain, gate: round.gate, most: round.smooth.traced_nodes, stop: round.stop };
+                let bricks = match self.bricks.take() {
+                    Some(bricks) => bricks,
+                    None => DeviceBricks::new(&self.gpu)?,
+                };
+                self.traced_nodes = self.bricks.insert(bricks).fill(node_grid(&self.nodes, round)?, renderer, &wanted, answers)?;
             }
         }
         let planes = SUM_PLANES * width * height;

@@ -343,7 +343,9 @@ fn step(name: &str, settings: &Value) -> Result<Option<Step>, String> {
             width => Err(format!("its codec `shuffle` has elements of {width} bytes; accepted are 1 to 64")),
         },
         "bitround" => Ok(None),
-        _ => Err(format!("its values are stored with the codec `{name:.80}`; accepted are {ACCEPTED}")),
+        _ => Err(format!(
+            "its values are stored with the codec `{name:.80}`; accepted are {ACCEPTED}: xarray writes the store anew with one of them (`encoding`)"
+        )),
     }
 }
 
