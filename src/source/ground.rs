@@ -15,6 +15,8 @@ use ridgewatch_field::EARTH_RADIUS;
 const REACH: f64 = 20_000.0;
 /// Metres of a map in a metre on the ground. Others are those of an idealised model, whose longitudes are made up.
 const SCALES: std::ops::RangeInclusive<f64> = 0.2..=6.0;
+/// Largest second difference of the scale along rows, root mean square, as a share of it: a map of 300 km a cell has 0.001.
+const MOST_BENT: f64 = 0.01;
 
 /// Turns velocities over the ground to the x and y of a grid, and stretches them to its metres.
 #[derive(Debug, Clone, PartialEq)]
@@ -205,6 +207,15 @@ fn measured(degrees: &[[f64; 2]], xs: &[f64], ys: &[f64]) -> Option<Vec<Jacobian
     {
         return None;
     }
+    // Coarsely rounded places scatter from node to node, as no map does.
+    let bends = found.chunks(width).flat_map(|row| row.windows(3)).map(|nodes| {
+        let [before, here, after] = [0, 1, 2].map(|k| scale(&nodes[k]));
+        (before - 2.0 * here + after) / here
+    });
+    let (sum, count) = bends.filter(|bend| bend.is_finite()).fold((0.0, 0u32), |(sum, count), bend| (sum + bend * bend, count + 1));
+    if (sum / f64::from(count.max(1))).sqrt() > MOST_BENT {
+        return None;
+    }
     for row in found.chunks_mut(width) {
         let known: Vec<usize> = (0..width).filter(|&i| is_known(&row[i])).collect();
         for i in 0..width {
@@ -264,6 +275,9 @@ mod tests {
         }
         let made_up: Vec<[f64; 2]> = (0..121 * 121).map(|n| [(n % 121) as f64, 10.0 + (n / 121) as f64 * 0.5]).collect();
         assert_eq!(measured(&made_up, &coordinates, &coordinates), None);
+        // To a hundredth of a degree, a kilometre.
+        let rounded: Vec<[f64; 2]> = (0..121 * 121).map(|n| place(1.1, n).map(|angle| (100.0 * angle).round() / 100.0)).collect();
+        assert_eq!(measured(&rounded, &coordinates, &coordinates), None);
     }
 
     #[test]

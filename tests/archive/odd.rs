@@ -108,6 +108,15 @@ fn units_are_stated() {
     // Longitudes in metres are no longitudes.
     let axes: [(&str, &str, &[f64]); 3] = [("time", HOURS, &[0.0, 1.0]), ("lat", "m", &X), ("lon", "m", &X)];
     let flat = winds(Fixture::on(CLASSIC, &axes), 2).write(&dir.path().join("flat.nc"));
+    // Nor are those of a turned mesh, which has no rows.
+    let mut turned = Fixture::new(CLASSIC, &[("time", 2), ("y", 3), ("x", 3)]).axis("time", HOURS, &[0.0, 1.0]);
+    for (k, name) in ["nav_lon", "nav_lat"].into_iter().enumerate() {
+        let values = fill(1, 3, 3, |_, y, x| 1000.0 * [x as f64 - 0.5 * y as f64, y as f64 + 0.5 * x as f64][k]);
+        turned = turned.variable(name, &["y", "x"], Data::F64(values)).with("units", "m");
+    }
+    let turned = turned.variable("u", &["time", "y", "x"], f32s(vec![1.0; 18])).with("units", "m/s");
+    let turned = turned.variable("v", &["time", "y", "x"], f32s(vec![1.0; 18])).with("units", "m/s").write(&dir.path().join("turned.nc"));
+    refused(&[turned], "", &["coordinates in metres of two dimensions (nav_lon, nav_lat)", "longitudes and latitudes in degrees alone"]);
     assert_eq!(open(&[flat]).grid().geometry, Geometry::Cartesian);
 }
 

@@ -369,7 +369,16 @@ impl Planner<'_> {
         let name = &listing.dimensions[dimension].name;
         let angle = |v: &Variable| matches!(classify(v), Kind::Longitude | Kind::Latitude);
         let wide = listing.matching(|v| v.dimensions.len() >= 2 && v.dimensions.contains(&dimension) && angle(v));
-        let wide: Vec<&str> = wide.map(|i| self.variable(i).name.as_str()).collect();
+        let wide: Vec<usize> = wide.collect();
+        let are_metres = !wide.is_empty() && wide.iter().all(|&i| self.is_in_metres(classify(self.variable(i)), i));
+        let wide: Vec<&str> = wide.iter().map(|&i| self.variable(i).name.as_str()).collect();
+        if are_metres {
+            return format!(
+                "dimension `{name}` has only coordinates in metres of two dimensions ({}), along which its rows do not run: a turned or bent mesh is read by \
+                 longitudes and latitudes in degrees alone. Put the velocities onto rows first, or write the longitudes and latitudes of the points into the file",
+                wide.join(", ")
+            );
+        }
         let why = if wide.is_empty() {
             "has no coordinate variable".into()
         } else {
