@@ -297,6 +297,24 @@ fn w_has_heights_of_its_own() {
     assert!(snapshot.nodes.iter().all(|node| node[3].is_nan() || node[3] == 0.0));
 }
 
+/// NEMO: w lies at `gdepw_0` beside `gdept_0`.
+#[test]
+fn w_of_nemo_lies_between_the_depths_that_are_named() {
+    let dir = tempdir().unwrap();
+    let layers = Layers {
+        name: "gdept_0",
+        unit: ("m", 1.0),
+        named: false,
+        moves: false,
+        height: |_, k, lon| sloping(0, k, lon),
+        ..Layers::default()
+    };
+    let mut fixture = layers.fixture();
+    fixture.variables.iter_mut().filter(|v| v.name == "gdept_0_w").for_each(|v| v.name = "gdepw_0".into());
+    let mut archive = open_with(&[fixture.write(&dir.path().join("nemo.nc"))], "z = \"gdept_0\"\nheights = [-60.0, -30.0, -10.0]");
+    assert!(layers.check(&mut archive) > 150);
+}
+
 /// A depth that nothing calls one is told by the water.
 #[test]
 fn depths_of_water_are_positive_down() {

@@ -27,6 +27,8 @@ struct Sea {
     flow: fn(f64, f64) -> [f64; 2],
     /// Each cell is two triangles of an unstructured mesh, not a part of rows and columns.
     triangles: bool,
+    /// Nothing moves at the first time.
+    begins_at_rest: bool,
 }
 
 /// Eddies of 2.5 to 4 degrees.
@@ -54,6 +56,7 @@ const TURNED: Sea = Sea {
     },
     flow: eddies,
     triangles: false,
+    begins_at_rest: false,
 };
 
 /// Columns from 0.08 degrees in the middle to 0.5 degrees at the sides.
@@ -63,6 +66,7 @@ const STRETCHED: Sea = Sea {
     index: |x, y| [30.0 + 30.0 / 2.5 * (x / 6.0 * 2.5f64.sinh()).asinh(), 20.0 + y / 0.3],
     flow: jet,
     triangles: false,
+    begins_at_rest: false,
 };
 
 /// Rows of which each lies three columns further east.
@@ -72,6 +76,7 @@ const SHEARED: Sea = Sea {
     index: |x, y| [30.0 + (x - 3.0 * y) / 0.3, 20.0 + y / 0.3],
     flow: eddies,
     triangles: false,
+    begins_at_rest: false,
 };
 
 impl Sea {
@@ -109,7 +114,8 @@ impl Sea {
         }
         for (c, (name, standard)) in [("uo", "eastward_sea_water_velocity"), ("vo", "northward_sea_water_velocity")].into_iter().enumerate()
         {
-            let values = (0..2 * nx * ny).map(|n| (self.flow)(places[n % (nx * ny)][0], places[n % (nx * ny)][1])[c]).collect();
+            let factor = |n: usize| if self.begins_at_rest && n < nx * ny { 0.0 } else { 1.0 };
+            let values = (0..2 * nx * ny).map(|n| factor(n) * (self.flow)(places[n % (nx * ny)][0], places[n % (nx * ny)][1])[c]).collect();
             fixture = fixture.variable(name, &["time", "y", "x"], f32s(values)).with("standard_name", standard).with("units", "m s-1");
         }
         fixture.write(path)
@@ -260,6 +266,18 @@ fn grids_are_refined_until_they_carry_particles_as_the_mesh_does() {
         assert!(share(report.error) < 0.025 && share(report.error_between.unwrap()) < 0.007 && report.warning.is_none(), "{report:?}");
         assert!(report.what.contains("times finer than the mesh's median spacing, for errors of at most 2.5 %"), "{}", report.what);
     }
+}
+
+/// A run that begins at rest: the grid is chosen by a later time.
+#[test]
+fn a_first_snapshot_at_rest_does_not_choose_the_grid() {
+    let dir = tempdir().unwrap();
+    let moving = TURNED.write(&dir.path().join("moving.nc"));
+    let resting = Sea { begins_at_rest: true, ..TURNED }.write(&dir.path().join("resting.nc"));
+    let keys = "mask = \"none\"";
+    assert_eq!(open_with(&[&resting], keys).grid().shape(), open_with(&[&moving], keys).grid().shape());
+    let report = inspected(&[&resting]).resampling.unwrap();
+    assert!(report.velocity > 0.1 && report.error < 0.025 * report.velocity, "{report:?}");
 }
 
 #[test]
