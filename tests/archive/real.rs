@@ -162,13 +162,14 @@ fn automatic_steps_see_the_kinks_of_linear_interpolation() {
     }
 }
 
-/// Compares the FTLE with ftle.py: it differs by a share of `most`, and by 3 % with the defaults of a scene. Returns the former pairs.
-fn agreeing(kind: &str, files: &Path, tau: f64, most: f64) -> Pairs {
+/// Compares the FTLE with ftle.py: it differs by a share of `most` and correlates by `least`, and differs by 3 % with the defaults of a scene. Returns the
+/// former pairs.
+fn agreeing(kind: &str, files: &Path, tau: f64, [most, least]: [f64; 2]) -> Pairs {
     let files = [files.to_owned()];
     let compared = Compared { kind, files: &files, keys: "", tau };
     let pairs = compared.exactly();
     let (relative, correlation) = pairs.report(kind);
-    assert!(relative < most && correlation > 1.0 - most, "{kind}: {relative} {correlation}");
+    assert!(relative < most && correlation > least, "{kind}: {relative} {correlation}");
     let (relative, correlation) = compared.by_default().report(&format!("{kind}, by default"));
     assert!(relative < 0.03 && correlation > 0.99, "{kind}: {relative} {correlation}");
     pairs
@@ -183,7 +184,7 @@ fn per_second(log_stretch: &[f64], tau: f64) -> Vec<f64> {
 #[ignore = "needs real archives: make test-data"]
 fn globcurrent_agrees_with_an_independent_integration() {
     let (files, tau) = (data("globcurrent").join("*.nc"), 5.0 * 86_400.0);
-    let pairs = agreeing("globcurrent", &files, tau, 1e-3);
+    let pairs = agreeing("globcurrent", &files, tau, [1e-3, 0.9999]);
     // A point is on land if one of the 4 x 4 nodes of cubic interpolation, the default in two dimensions, is missing.
     let mut archive = open(&[&files]);
     let snapshot = archive.read(59).unwrap();
@@ -199,7 +200,7 @@ fn globcurrent_agrees_with_an_independent_integration() {
 #[ignore = "needs real archives: make test-data"]
 fn era5_agrees_with_an_independent_integration() {
     let (files, tau) = (data("era5_utm32_2025_05_01_00.nc").with_file_name("era5_utm32_*.nc"), 7200.0);
-    let pairs = agreeing("era5", &files, tau, 1e-6);
+    let pairs = agreeing("era5", &files, tau, [1e-6, 0.999_999_9]);
     // The rim is visible behind transparent parts; 0.040 was measured.
     looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.theirs, tau), 0.03..=0.05);
 }
@@ -209,7 +210,7 @@ fn era5_agrees_with_an_independent_integration() {
 fn wrf_agrees_with_an_independent_integration() {
     let (file, tau) = (data("wrf_katrina_uvw_4t.nc"), 3600.0);
     // Horizontally the same interpolant; vertically fixed heights here, the levels of each column there.
-    let pairs = agreeing("wrf", &file, tau, 0.024);
+    let pairs = agreeing("wrf", &file, tau, [0.024, 0.9992]);
     // Outside of the nest; 0.128 was measured.
     looks_right("WRF", &replay(&file, tau), &per_second(&pairs.theirs, tau), 0.1..=0.16);
 }

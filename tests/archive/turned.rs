@@ -97,7 +97,7 @@ fn winds_to_the_east_are_turned_onto_a_projection() {
         let (sine, cosine) = x[i % 21].atan2(-y[i / 21]).sin_cos();
         let expected = [3.0 * cosine - 4.0 * sine, 3.0 * sine + 4.0 * cosine].map(|v| v * scale(x[i % 21], y[i / 21]));
         let error = (0..2).map(|k| (f64::from(node[k]) - expected[k]).abs()).fold(0.0, f64::max);
-        assert!(error < 1e-2, "node {i}: {error}");
+        assert!(error < 5e-3, "node {i}: {error}");
     }
     assert!(notes(&archive).contains("by the longitudes and latitudes of the nodes"), "{}", notes(&archive));
     // Winds that run along x and y are stretched alone.
@@ -105,7 +105,7 @@ fn winds_to_the_east_are_turned_onto_a_projection() {
     for (i, node) in along.read(1).unwrap().nodes.iter().enumerate() {
         let expected = [3.0, 4.0].map(|v| v * scale(x[i % 21], y[i / 21]));
         let error = (0..2).map(|k| (f64::from(node[k]) - expected[k]).abs()).fold(0.0, f64::max);
-        assert!(error < 1e-2, "node {i}: {error}");
+        assert!(error < 5e-3, "node {i}: {error}");
     }
     assert!(notes(&along).contains("stretched to the metres of the projection by the longitudes and latitudes"), "{}", notes(&along));
     let lost = notes(&open_with(&[write(["x_wind", "y_wind"], false, "lost.nc")], "metric = \"cartesian\""));

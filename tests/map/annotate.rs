@@ -13,8 +13,9 @@ fn replay(out: &Path, width: usize, options: &[&str]) {
         "time.frames_per_slide=1",
         "time.warmup_frames=0",
         "render.samples=1",
-        // Marching goes on as time allows, so that two runs need not be equal.
-        "render.method=reference",
+        // Marching and training go on as time allows, so that two runs of them need not be equal.
+        "render.method=gated",
+        "surrogate.kind=table",
         "flow.steps=40",
         &size[0],
         &size[1],
@@ -50,12 +51,12 @@ fn a_strip_below_leaves_the_frame_as_it_is() {
         let (alone, with) = (picture(&plain, frame), picture(&annotated, frame));
         assert_eq!((alone.dimensions(), with.width()), ((336, 168), 336));
         assert!(part(&with, 0, 168) == alone, "the picture itself, pixel by pixel");
-        // A colour bar and two lines of text: `reference` states no error.
+        // A colour bar and at least three lines of text, each of 12 pixels.
         let strip = part(&with, 168, with.height());
         assert!((80..300).contains(&strip.height()), "{}", strip.height());
         let below_bar = part(&strip, 60, strip.height());
         let ([dark, _], [letters, _], [_, coloured]) = (ink(&strip), ink(&below_bar), ink(&part(&strip, 0, 60)));
-        assert!(letters > 150 && dark > letters && coloured > 500, "{letters} {dark} {coloured}");
+        assert!(letters > 300 && dark > letters && coloured > 500, "{letters} {dark} {coloured}");
         strips.push(strip);
         let [a, b] = [&plain, &annotated].map(|run| read_exr(&run.join(format!("frames/frame_{frame:06}.exr"))).unwrap());
         assert!(a.rgba == b.rgba && a.width == 336, "the EXR is the same");
