@@ -95,7 +95,7 @@ pub struct FrameRecord {
     /// Optical residual of the steps against twice as many as the log-stretch asks for. `None` unless the steps were chosen by it.
     #[serde(default)]
     pub integration_residual: Option<f64>,
-    /// Points traced before the frame, to open the gate and tighten the majorants (first frame of a slide).
+    /// Points traced before the frame: to open the gate and tighten the majorants (first frame of a slide), and nodes of a network that is not trusted there.
     pub preparation_traces: u64,
     /// Audit points traced for the frame, except at missing cells.
     pub audited: u64,

@@ -179,6 +179,11 @@ struct ArchiveSlides {
     taken: usize,
 }
 
+/// Date of a time, if it is known.
+fn date_of(dates: &[(f64, Option<String>)], time: f64) -> Option<&String> {
+    dates.iter().find(|(known, _)| *known == time).and_then(|(_, date)| date.as_ref())
+}
+
 impl Slides for ArchiveSlides {
     fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError> {
         if self.count.is_over() {
@@ -194,12 +199,9 @@ impl Slides for ArchiveSlides {
             warnings.extend(news.warnings);
             let newest = window.newest();
             match window.push(snapshot?) {
-                Ok(pushed) => warnings.extend(pushed.warning.map(|warning| {
-                    let known = self.dates.iter().find(|(time, _)| *time == warning.time());
-                    match known.and_then(|(_, date)| date.as_ref()) {
-                        Some(date) => format!("{date}: {warning}"),
-                        None => warning.to_string(),
-                    }
+                Ok(pushed) => warnings.extend(pushed.warning.map(|warning| match date_of(&self.dates, warning.time()) {
+                    Some(date) => format!("{date}: {warning}"),
+                    None => warning.to_string(),
                 })),
                 Err(fault) => warnings.push(fault.to_string()),
             }
@@ -220,7 +222,7 @@ impl Slides for ArchiveSlides {
     }
 
     fn date(&self, time: f64) -> Option<String> {
-        self.dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone())
+        date_of(&self.dates, time).cloned()
     }
 
     fn listen(&self, listener: Listener) {

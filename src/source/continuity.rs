@@ -6,8 +6,8 @@ use ridgewatch_field::{Axis, Geometry, Grid};
 const POLE: f64 = 1e-6;
 
 /// Vertical velocity at the nodes of a grid whose levels are metres, upwards, m/s: w(z) is minus the integral of du/dx + dv/dy from the lowest node of the column
-/// that is known, where w is 0, up to z; in the air, whose density falls as exp(-z / H), each part of the integral grows by its share of the density. Differences are of second order, integration by trapezoids. u and v at missing nodes beside known ones count as 0: nothing
-/// flows into land.
+/// that is known, where w is 0, up to z. In the air, whose density falls as exp(-z / H), each part of the integral grows by its share of the density. Differences
+/// are of second order, integration by trapezoids. u and v at missing nodes beside known ones count as 0: nothing flows into land.
 ///
 /// `scale_height`: H in the grid's metres; `None` in water.
 pub fn vertical_velocity(grid: &Grid, u: &[f32], v: &[f32], scale_height: Option<f64>) -> Vec<f32> {
