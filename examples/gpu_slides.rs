@@ -64,8 +64,8 @@ impl Backend for Timed {
         renderer: &mut Renderer,
         accumulated: &mut Self::Picture,
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
-        let &FrameJob { tracer, surrogate, routing, picture, samples, smooth, progress, stop } = job;
-        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, smooth, progress, stop }, renderer, accumulated)
+        let &FrameJob { tracer, surrogate, routing, picture, samples, smooth, is_map, progress, stop } = job;
+        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, smooth, is_map, progress, stop }, renderer, accumulated)
     }
     fn audit(
         &mut self,

@@ -28,6 +28,8 @@ mod kit;
 mod live;
 #[path = "gpu/lost.rs"]
 mod lost;
+#[path = "gpu/maps.rs"]
+mod maps;
 #[path = "gpu/network.rs"]
 mod network;
 #[path = "gpu/network_flow_map.rs"]

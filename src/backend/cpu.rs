@@ -14,7 +14,7 @@ use ridgewatch_base::progress;
 use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement, own_nodes};
-use ridgewatch_render::{Film, RenderStats, Renderer};
+use ridgewatch_render::{Film, MapPicture, RenderStats, Renderer};
 use ridgewatch_source::Listener;
 use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, Trace, build,
@@ -83,6 +83,7 @@ pub struct HostFrame<'a> {
     picture: u64,
     samples: f64,
     smooth: Option<Smooth>,
+    is_map: bool,
     progress: Option<&'a (dyn Fn(f32) + Sync)>,
     stop: &'a AtomicBool,
 }
@@ -90,8 +91,8 @@ pub struct HostFrame<'a> {
 impl<'a> HostFrame<'a> {
     /// Takes the settings of a backend's job, with `tracer` and `surrogate` as the CPU calls them.
     pub fn of<B: Backend>(job: &FrameJob<'a, B>, tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>) -> Self {
-        let &FrameJob { routing, picture, samples, smooth, progress, stop, .. } = job;
-        Self { tracer, surrogate, routing, picture, samples, smooth, progress, stop }
+        let &FrameJob { routing, picture, samples, smooth, is_map, progress, stop, .. } = job;
+        Self { tracer, surrogate, routing, picture, samples, smooth, is_map, progress, stop }
     }
 }
 
@@ -100,6 +101,7 @@ impl<'a> HostFrame<'a> {
 pub struct HostPicture {
     nodes: Option<Nodes>,
     picture: Picture,
+    map: MapPicture,
     /// Bricks that were traced instead, and the values of their own nodes, one after the other.
     traced: TracedBricks,
     traced_values: Vec<f32>,
@@ -207,17 +209,36 @@ fn refine_on_cpu(
     if let Some(report) = frame.progress {
         report(1.0);
     }
-    let stopped = || {
-        let settings = &renderer.scene().settings;
-        (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() })
-    };
     Ok(match refined {
         Some((film, stats, error)) => Rendered { film, stats, tally, samples, error: Some(error).filter(PictureError::is_known) },
         None => {
-            let (film, stats) = stopped();
+            let (film, stats) = stopped(renderer);
             Rendered { film, stats, tally, samples, error: None }
         }
     })
+}
+
+/// Adds to a map. Its points are chosen and its pixels summed on the CPU, whatever device traces.
+fn refine_map(frame: &HostFrame<'_>, renderer: &Renderer, picture: &mut HostPicture) -> Result<Rendered<Samples>, DeviceError> {
+    let tracer = Interruptible::new(frame.tracer, frame.stop);
+    let mut router = QueryRouter::new(&tracer, None, frame.routing);
+    let progress = frame.progress.map(|report| report as &dyn Fn(f32));
+    let refined = picture.map.refine(renderer, frame.samples, &mut router, progress, frame.stop);
+    let (tally, samples) = router.finish()?;
+    let (film, stats, error) = match refined {
+        Some((film, stats, error)) => (film, stats, Some(error).filter(PictureError::is_known)),
+        None => {
+            let (film, stats) = stopped(renderer);
+            (film, stats, None)
+        }
+    };
+    Ok(Rendered { film, stats, tally, samples, error })
+}
+
+/// What is left of a frame that was stopped.
+fn stopped(renderer: &Renderer) -> (Film, RenderStats) {
+    let settings = &renderer.scene().settings;
+    (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() })
 }
 
 /// Renders a frame on the CPU.
@@ -225,6 +246,9 @@ fn refine_on_cpu(
 /// # Errors
 /// The device of the tracer or of the surrogate fails, or the renderer rejects the number of samples. The state of `renderer` is then unspecified.
 pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer, picture: &mut HostPicture) -> Result<Rendered<Samples>, DeviceError> {
+    if frame.is_map {
+        return refine_map(frame, renderer, picture);
+    }
     if let Some(smooth) = frame.smooth {
         return refine_on_cpu(frame, smooth, renderer, picture);
     }

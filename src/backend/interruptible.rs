@@ -1,7 +1,7 @@
 //! A tracer that can be stopped. It traces large batches in parts and checks the stop flag between them, because preparing a slide may take minutes.
 
 use super::DeviceError;
-use ridgewatch_base::progress;
+use ridgewatch_base::progress::Work;
 use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, Traced, Tracer};
 use ridgewatch_surrogate::Trace;
@@ -52,8 +52,9 @@ impl Trace for Interruptible<'_> {
         let mut done = 0;
         let mut piece = Traced::default();
         *out = Traced::default();
+        let work = Work::begin("tracing");
         while done < seeds.len() && !self.stop.load(Ordering::Relaxed) {
-            progress::mark();
+            work.reached(done, seeds.len());
             let part = &seeds[done..seeds.len().min(done + self.part())];
             let start = Instant::now();
             if part.len() == seeds.len() {

@@ -209,8 +209,10 @@ pub struct FrameJob<'a, B: Backend> {
     pub picture: u64,
     /// Samples per pixel.
     pub samples: f64,
-    /// `Some` for methods whose picture accumulates; `None`: the frame is tracked.
+    /// `Some` for methods that march the surrogate; `None`: the frame is tracked, unless it is a map.
     pub smooth: Option<Smooth>,
+    /// The picture is a map, which accumulates and has no surrogate.
+    pub is_map: bool,
     /// Called with the share of the frame that is rendered, from 0 to 1.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
     /// Setting it ends the frame soon, within a wave where the CPU traces and after the wave in progress where a device does. The frame is then

@@ -171,6 +171,7 @@ impl Training<'_> {
             picture: 0,
             samples: settings.render.samples.ceil().max(1.0),
             smooth: None,
+            is_map: false,
             progress: None,
             stop,
         };

@@ -223,8 +223,8 @@ pub fn chosen_steps(steps: u64, difference: f64, residual: Option<f64>) -> Strin
 pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Result<()> {
     let Some(path) = path else { return Ok(()) };
     let refuse = |why: &str| bail!(Usage(format!("{option} {}: {why}", path.display())));
-    if scene.render.method == Method::Reference {
-        return refuse("method reference has no surrogate; accepted with methods two_level, marched, surrogate and gated");
+    if !scene.render.method.has_surrogate() {
+        return refuse("methods reference and map have no surrogate; accepted with methods two_level, marched, surrogate and gated");
     }
     if scene.surrogate.kind == Kind::Table {
         return refuse("a table is traced anew for every window and is not trained; accepted with surrogate.kind network and residual");
@@ -261,7 +261,7 @@ pub fn word<T: serde::de::DeserializeOwned>(word: &str, accepted: &str) -> Resul
 
 /// Parses a method.
 pub fn method(text: &str) -> Result<Method, String> {
-    word(text, "auto, reference, surrogate, neural, gated, marched, two_level")
+    word(text, "default, map, auto, reference, surrogate, neural, gated, marched, two_level")
 }
 
 /// Parses a number of threads.

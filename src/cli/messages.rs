@@ -1,6 +1,7 @@
 //! Messages on standard error.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressState, ProgressStyle};
+use ridgewatch::progress::work;
 use std::io::{IsTerminal, Write, stderr};
 use tracing_subscriber::EnvFilter;
 
@@ -56,11 +57,11 @@ pub fn note_aside(text: impl std::fmt::Display) {
 pub fn progress(length: Option<u64>) -> ProgressBar {
     let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let (bar, style) = match length {
-        Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} eta {eta} {msg}"),
-        None => (ProgressBar::new_spinner(), "{spinner} {pos} {elapsed_precise} {msg}"),
+        Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} eta {eta} {msg}{work}"),
+        None => (ProgressBar::new_spinner(), "{spinner} {pos} {elapsed_precise} {msg}{work}"),
     };
     bar.set_draw_target(target);
-    bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar.set_style(with_work(style));
     // Keeps its clock running, on a thread, for which indicatif panics if the system refuses one.
     let has_room = || std::thread::Builder::new().spawn(|| ()).is_ok_and(|thread| thread.join().is_ok());
     if stderr().is_terminal() && has_room() {
@@ -69,11 +70,22 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     bar
 }
 
+/// A style whose `{work}` is the work in progress that takes more than two seconds, with the share done and the time left.
+fn with_work(template: &str) -> ProgressStyle {
+    let work = |_: &ProgressState, out: &mut dyn std::fmt::Write| {
+        if let Some(words) = work() {
+            // A text that is not written is not shown.
+            let _ = write!(out, " ({words})");
+        }
+    };
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()).with_key("work", work)
+}
+
 /// A spinner with the elapsed time, for work of unknown length; drawn only when standard error is a terminal.
 pub fn spinner(text: String) -> ProgressBar {
     // Clears itself when dropped.
     let bar = progress(None).with_finish(ProgressFinish::AndClear);
-    bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
+    bar.set_style(with_work("{spinner} {elapsed_precise} {msg}{work}"));
     bar.set_message(text);
     bar
 }

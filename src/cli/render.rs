@@ -20,13 +20,13 @@ pub struct Options {
     /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
+    /// default, map (two dimensions), auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
     #[arg(long, value_name = "N")]
     spp: Option<f64>,
-    /// marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3, and its interval reaches at most 20 % beyond.
+    /// map, marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3, and its interval reaches at most 20 % beyond.
     #[arg(long, value_name = "TARGET")]
     until: Option<Target>,
     /// two_level: milliseconds of sampling per frame, instead of --spp.

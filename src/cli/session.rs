@@ -10,8 +10,8 @@ use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::map::{MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
-    DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
-    WhenDiskSlow,
+    DEFAULT_ENDPOINT, FileStatistics, MapAbout, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder,
+    Summary, WhenDiskSlow,
 };
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
@@ -33,7 +33,7 @@ pub struct RunArguments {
     /// Keep only the newest N frames on disk.
     #[arg(long, value_name = "N")]
     keep: Option<usize>,
-    /// auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
+    /// default, map (two dimensions), auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Publish frames at this ZeroMQ endpoint (port 0: any free one, which is printed); by default they go to files only.
@@ -183,7 +183,7 @@ impl Session<'_> {
         if let Some(commands) = &commands {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
-        let newest = Arc::new(NewestFrame::new(&out));
+        let newest = Arc::new(NewestFrame::new(&out, MapAbout::new(&setup.plan)));
         let shown = options.dashboard.zip(output.endpoint());
         let dashboard = shown.and_then(|(port, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
@@ -344,10 +344,12 @@ fn print_report(report: &RunReport, last: Option<&FrameRecord>) {
     let mut text = format!("{} frames of {} slides", report.frames, report.slides);
     if let Some(last) = last {
         text += &format!(
-            "; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps\nlast frame: {}",
+            "; {} Runge-Kutta steps a path{}\nlast frame: {}",
             report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
-            report.surrogate_bytes as f64 / 1e6,
-            report.train_steps,
+            match report.surrogate_bytes {
+                0 => String::new(),
+                bytes => format!("; surrogate {:.2} MB after {} optimizer steps", bytes as f64 / 1e6, report.train_steps),
+            },
             line(last)
         );
     }
@@ -404,9 +406,12 @@ pub fn line(record: &FrameRecord) -> String {
         None => format!("t = {}, ", record.time),
     };
     let queries = record.queries - record.missing;
-    text += &match record.method == "gated" && record.traced_share >= NOTHING_SAVED {
-        true => format!("the surrogate saved nothing: {:.1} % of {queries} queries were traced", 100.0 * record.traced_share),
-        false => format!("traced {:.1} % of {queries} queries", 100.0 * record.traced_share),
+    text += &match record.method.as_str() {
+        "map" => format!("{queries} seeds"),
+        "gated" if record.traced_share >= NOTHING_SAVED => {
+            format!("the surrogate saved nothing: {:.1} % of {queries} queries were traced", 100.0 * record.traced_share)
+        }
+        _ => format!("traced {:.1} % of {queries} queries", 100.0 * record.traced_share),
     };
     if record.missing > 0 {
         text += &format!(", {} more on land", record.missing);

@@ -4,6 +4,7 @@ use super::view::View;
 use crate::backend::{BackendError, Device};
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowMap, Traced, VelocitySource, cpu_tracer};
+use crate::render::footprint;
 use crate::surrogate::Trace;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -132,22 +133,9 @@ impl Variances {
     }
 }
 
-/// A well-mixed hash (splitmix64).
-fn mixed(value: u64) -> u64 {
-    let z = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
-
-/// Places of the seeds of one half of a pixel, in [0, 1)^2: Roberts' low-discrepancy sequence R2 (2018), shifted at random modulo 1, so that each half
-/// is unbiased and independent of the other.
+/// Places of the seeds of one half of a pixel ([`footprint`]).
 pub(super) fn offsets(sampling: Sampling, pixel: usize, half: usize) -> impl Iterator<Item = [f64; 2]> {
-    // Reciprocals of the plastic number and its square.
-    const STEP: [f64; 2] = [0.754_877_666_246_693, 0.569_840_290_998_053];
-    let bits = mixed(mixed(sampling.seed) ^ (2 * pixel + half) as u64);
-    let shift = [bits >> 32, bits & 0xffff_ffff].map(|b| b as f64 / 4_294_967_296.0);
-    (0..sampling.seeds / 2).map(move |k| [0, 1].map(|axis| (shift[axis] + k as f64 * STEP[axis]).fract()))
+    footprint(sampling.seed, pixel, half, 0..sampling.seeds / 2)
 }
 
 impl Raster {

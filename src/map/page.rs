@@ -5,6 +5,7 @@ use super::sheet::{Bar, DrawError, Image, LEFT, Pen, Sheet, sheet_png, sheet_svg
 use super::words::{Rate, date, duration, number};
 use crate::flow::Direction;
 use crate::publish::Picture;
+use crate::render::Method;
 use crate::run::{ColorBar, FrameRecord};
 use plotters::prelude::{BLACK, Color as _, DrawingBackend, FontTransform};
 
@@ -174,7 +175,8 @@ fn words(record: &FrameRecord) -> Vec<String> {
     }
     let surrogate = record.surrogate.as_ref().map_or_else(String::new, |kind| format!(" with surrogate {kind}"));
     let samples = record.picture_error.map_or(record.samples_per_pixel, |error| error.samples_per_pixel);
-    words.push(format!("Method: {}{surrogate}, {} samples a pixel, on {}.", record.method, number(samples), record.device));
+    let what = if record.method == Method::Map.name() { "seeds" } else { "samples" };
+    words.push(format!("Method: {}{surrogate}, {} {what} a pixel, on {}.", record.method, number(samples), record.device));
     words.push(format!("{} {}", picture_error(record), traced_error(record)).trim_end().to_owned());
     words.push(format!("Drawn by ridgewatch {}.", env!("CARGO_PKG_VERSION")));
     words
@@ -186,8 +188,9 @@ pub(super) fn picture_error(record: &FrameRecord) -> String {
         // The peak of the picture is 1.
         let share = |decibels: f64| number(100.0 * 10f64.powf(-decibels / 20.0));
         let [value, low, high] = [error.psnr.value, error.psnr.low, error.psnr.high];
+        let pixels = if record.method == Method::Map.name() { "pixels with a value" } else { "lit pixels" };
         return format!(
-            "Error of colours: {} % rms [{}, {}], {value:.1} dB [{low:.1}, {high:.1}], over lit pixels, 95 % intervals.",
+            "Error of colours: {} % rms [{}, {}], {value:.1} dB [{low:.1}, {high:.1}], over {pixels}, 95 % intervals.",
             share(value),
             share(high),
             share(low)

@@ -24,7 +24,8 @@ pub struct Film {
     pub missing: Vec<f32>,
     /// Number of log-stretch queries.
     pub queries: Vec<f32>,
-    /// Stated error of the linear radiance, root mean square over the channels and the neighbourhood. Empty for tracked pictures.
+    /// Stated error of the linear radiance, root mean square over the channels and the neighbourhood; of a map, of the FTLE (1/time). Empty for tracked
+    /// pictures.
     pub error: Vec<f32>,
 }
 

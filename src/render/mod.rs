@@ -14,6 +14,7 @@ mod error;
 mod film;
 mod light;
 mod majorant;
+mod map_picture;
 mod parameters;
 mod renderer;
 mod scene;
@@ -32,6 +33,7 @@ pub use error::RenderError;
 pub use film::{Film, PixelValue};
 pub use light::Light;
 pub use majorant::{CellObservations, MajorantGrid};
+pub use map_picture::{MAP_TONE, MapPicture, footprint, map_radiance, viridis};
 pub use parameters::FrameParameters;
 pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
@@ -40,7 +42,7 @@ pub use settings::MAX_SAMPLES;
 pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
 pub use space::{GridPoint, SceneBox, overview_scale};
 pub use tracking::FrameScene;
-pub use transfer::Transfer;
+pub use transfer::{Transfer, map_range};
 
 /// Answers log-stretch queries. The renderer passes the collision points of one wavefront step per call.
 pub trait LogStretch {

@@ -125,6 +125,20 @@ impl Renderer {
         &self.transfer
     }
 
+    /// 1 / tau, by which a log-stretch becomes an FTLE.
+    pub fn inverse_tau(&self) -> f64 {
+        self.inverse_tau.into()
+    }
+
+    /// Domain point in the middle of a slab that is seen through a point of the film (`x` from -1, left, to 1; `y` from -1, bottom, to 1). `None` outside
+    /// of the domain.
+    pub fn map_point(&self, [x, y]: [f64; 2]) -> Option<DomainPoint> {
+        let (origin, direction) = self.camera.ray(x, y);
+        let along = (self.space.centre()[2] - origin[2]) / direction[2];
+        let point = std::array::from_fn(|k| origin[k] + along * direction[k]);
+        (along >= 0.0 && along.is_finite()).then(|| self.space.point_within(point))?
+    }
+
     /// Optical ramp of a log-stretch under the current transfer function: 0 where nothing is shown.
     pub fn ramp(&self, log_stretch: f32) -> f32 {
         self.transfer.ramp(log_stretch * self.inverse_tau)

@@ -31,11 +31,16 @@ pub enum Method {
     Gated,
     /// The surrogate's expected picture, marched; traced samples measure its error.
     Marched,
-    /// The marched picture, corrected by traced samples. The default.
+    /// The marched picture, corrected by traced samples.
     #[serde(rename = "two_level")]
     TwoLevel,
+    /// The FTLE itself of a flow of two dimensions, as a map: the mean over each pixel, traced.
+    Map,
     /// `two_level` or `reference`, by a trial before the run. A run itself has one of the others.
     Auto,
+    /// `map` for flows of two dimensions, unless the scene sets what only volumes have ([`Method::or_default`]), and `two_level` for others. The default.
+    /// A run itself has one of the others.
+    Default,
 }
 
 impl Method {
@@ -47,13 +52,34 @@ impl Method {
             Self::Gated => "gated",
             Self::Marched => "marched",
             Self::TwoLevel => "two_level",
+            Self::Map => "map",
             Self::Auto => "auto",
+            Self::Default => "default",
         }
     }
 
-    /// True if the picture accumulates and its error is stated ([`super::smooth`]), or may do so.
+    /// True if a surrogate answers queries, or may do so.
+    pub fn has_surrogate(self) -> bool {
+        !matches!(self, Self::Reference | Self::Map)
+    }
+
+    /// True if the surrogate is marched ([`super::smooth`]), or may be.
     pub fn is_smooth(self) -> bool {
-        matches!(self, Self::Marched | Self::TwoLevel | Self::Auto)
+        matches!(self, Self::Marched | Self::TwoLevel | Self::Auto | Self::Default)
+    }
+
+    /// True if the picture accumulates and its error is stated, or may be.
+    pub fn accumulates(self) -> bool {
+        self.is_smooth() || self == Self::Map
+    }
+
+    /// The method, or what `default` stands for.
+    pub fn or_default(self, is_map: bool) -> Self {
+        match self {
+            Self::Default if is_map => Self::Map,
+            Self::Default => Self::TwoLevel,
+            other => other,
+        }
     }
 }
 
@@ -210,11 +236,12 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Samples per pixel and frame. Smooth methods accept fractions; `marched` takes twice [`super::smooth::AUDIT_PAIRS`] instead.
+    /// Samples per pixel and frame. Smooth methods accept fractions; `marched` takes twice [`super::smooth::AUDIT_PAIRS`] instead, and `map` the next even
+    /// number.
     pub samples: f64,
     /// How the correction of `two_level` is added.
     pub combine: Combine,
-    /// Smooth methods: stated error at which a slide needs no further frames (see [`Target::is_met_by`]). A slide gets frames until then, at most
+    /// Smooth methods and `map`: stated error at which a slide needs no further frames (see [`Target::is_met_by`]). A slide gets frames until then, at most
     /// `MAX_FRAMES_UNTIL`.
     pub until: Option<Target>,
     /// `two_level`: milliseconds of coupled samples per frame, instead of `samples`.
@@ -232,7 +259,7 @@ pub struct RenderSettings {
 impl Default for RenderSettings {
     fn default() -> Self {
         Self {
-            method: Method::TwoLevel,
+            method: Method::Default,
             width: 320,
             height: 160,
             samples: 8.0,
@@ -265,7 +292,7 @@ impl RenderSettings {
         let pixels = settings.width * settings.height;
         require(pixels <= MAX_PIXELS, "render.width", settings.width, "at most 67108864 pixels in all")?;
         let samples = settings.samples;
-        if settings.method.is_smooth() {
+        if settings.method.accumulates() {
             let accepted = "1/64 to 4096 with this render.method";
             require((1.0 / 64.0..=4096.0).contains(&samples), "render.samples", samples, accepted)?;
         } else {
@@ -275,10 +302,10 @@ impl RenderSettings {
         if let Some(budget) = settings.budget {
             require((0.1..=600_000.0).contains(&budget), "render.budget", budget, "milliseconds, 0.1 to 600000")?;
         }
-        let until = settings.until.is_none() || settings.method.is_smooth();
-        require(until, "render.until", "given", "with render.method = \"marched\" or \"two_level\"")?;
+        let until = settings.until.is_none() || settings.method.accumulates();
+        require(until, "render.until", "given", "with render.method = \"map\", \"marched\" or \"two_level\"")?;
         // A marched picture has a fixed number of samples.
-        let budget = settings.budget.is_none() || matches!(settings.method, Method::TwoLevel | Method::Auto);
+        let budget = settings.budget.is_none() || matches!(settings.method, Method::TwoLevel | Method::Auto | Method::Default);
         require(budget, "render.budget", "given", "with render.method = \"two_level\"")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;

@@ -123,6 +123,17 @@ impl SceneBox {
         GridPoint(std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32)))
     }
 
+    /// Domain coordinates of a scene point; `None` outside of the box.
+    pub fn point_within(&self, point: [f64; 3]) -> Option<DomainPoint> {
+        let inside = (0..3).all(|k| (self.min[k]..=self.max[k]).contains(&point[k]));
+        inside.then(|| {
+            DomainPoint(std::array::from_fn(|k| {
+                let domain = self.domain_min[k] + (point[k] - self.min[k]) / self.cell_edge[k] * self.cell_extent[k];
+                (domain as f32).clamp(self.inward_min[k], self.inward_max[k])
+            }))
+        })
+    }
+
     /// Grid coordinates of a domain point, clamped to the grid.
     pub fn grid_of_domain(&self, point: DomainPoint) -> GridPoint {
         GridPoint(std::array::from_fn(|k| {

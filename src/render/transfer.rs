@@ -22,6 +22,28 @@ impl TransferSettings {
         let high = self.high.unwrap_or_else(|| quantile(0.995).max(min_high));
         Self { low: Some(low), high: Some(high), ..self.clone() }
     }
+
+    /// The same for a map, which shows values below the median too ([`map_range`]).
+    pub fn scaled_to_map(&self, ftle: &[f32]) -> Self {
+        let [low, high] = map_range(ftle.iter().copied(), false);
+        let open = Self { low: Some(self.low.unwrap_or(low)), high: Some(self.high.unwrap_or(high)), ..self.clone() };
+        // An end that is given may lie beyond the other.
+        if open.low < open.high { open } else { self.scaled_to(ftle) }
+    }
+}
+
+/// Range of the colours of a map: from 0, or the first percentile if that is negative or far from 0, to percentile 99.5. `from_white`: from percentile 40,
+/// so that white is what stretches little.
+pub fn map_range(ftle: impl Iterator<Item = f32>, from_white: bool) -> [f64; 2] {
+    let mut known: Vec<f64> = ftle.filter(|f| f.is_finite()).map(f64::from).collect();
+    if known.is_empty() {
+        return [0.0, 1.0];
+    }
+    known.sort_unstable_by(f64::total_cmp);
+    let percentile = |percent: f64| known[((known.len() - 1) as f64 * percent / 100.0).round() as usize];
+    let (low, high) = (percentile(if from_white { 40.0 } else { 1.0 }), percentile(99.5));
+    let low = if !from_white && low >= 0.0 && low < 0.5 * high { 0.0 } else { low };
+    if high > low + 1e-6 * high.abs() { [low, high] } else { [low - 0.5 * low.abs().max(1e-9), low + 0.5 * low.abs().max(1e-9)] }
 }
 
 /// Extinction and albedo as functions of the FTLE, checked and in f32.
@@ -77,6 +99,11 @@ impl Transfer {
         }
         let coefficients = self.albedo.each_ref().map(|channel| channel.len() as i32);
         TransferParameters { low: self.low, per_range: self.per_range, extinction_max: self.extinction_max, coefficients, albedo }
+    }
+
+    /// FTLE at which the extinction begins, and from which it is full.
+    pub fn range(&self) -> [f64; 2] {
+        [self.low.into(), f64::from(self.low) + 1.0 / f64::from(self.per_range)]
     }
 
     /// Parameters of the ramp of a log-stretch over `tau`: low, 1 / (high - low), and tau.

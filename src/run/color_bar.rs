@@ -4,7 +4,7 @@ use super::Settings;
 use super::record::{DomainRecord, FrameRecord};
 use super::setup::assemble;
 use crate::field::Domain;
-use crate::render::{Film, Renderer, Scene, TransferSettings};
+use crate::render::{Film, MAP_TONE, Method, Renderer, Scene, TransferSettings, map_radiance};
 use serde::{Deserialize, Serialize};
 
 /// Colours of a bar.
@@ -26,14 +26,18 @@ pub struct ColorBar {
 
 impl ColorBar {
     /// Colours between two values of the FTLE. `time_unit` may be empty.
-    pub fn new(renderer: &Renderer, [low, high]: [f64; 2], time_unit: &str) -> Self {
+    pub fn new(renderer: &Renderer, method: Method, [low, high]: [f64; 2], time_unit: &str) -> Self {
         let at = |i: usize| low + (high - low) * i as f64 / (COLORS - 1) as f64;
         let color = |i| {
-            let [r, g, b] = renderer.uniform_color(at(i) as f32);
+            let [r, g, b] = match method {
+                Method::Map => map_radiance(i as f64 / (COLORS - 1) as f64),
+                _ => renderer.uniform_color(at(i) as f32),
+            };
             [r, g, b, 1.0]
         };
         let film = Film { width: COLORS, height: 1, rgba: (0..COLORS).map(color).collect(), ..Film::default() };
-        let colors = film.tone_mapped(renderer.scene().settings.tone_map).as_chunks().0.to_vec();
+        let tone_map = if method == Method::Map { MAP_TONE } else { renderer.scene().settings.tone_map };
+        let colors = film.tone_mapped(tone_map).as_chunks().0.to_vec();
         let unit = if time_unit.is_empty() { String::new() } else { format!("1/{time_unit}") };
         Self { colors, low, high, unit }
     }
@@ -52,7 +56,8 @@ impl ColorBar {
         let (low, high, extinction) = (Some(transfer.low), Some(transfer.high), Some(transfer.extinction));
         scene.transfer = TransferSettings { low, high, extinction, ..scene.transfer };
         let renderer = Renderer::new(scene, &domain, record.tau).map_err(|error| format!("does not fit the scene: {error}"))?;
-        Ok(Self::new(&renderer, [transfer.low, transfer.high], &record.time_unit))
+        let method = if record.method == Method::Map.name() { Method::Map } else { Method::Reference };
+        Ok(Self::new(&renderer, method, [transfer.low, transfer.high], &record.time_unit))
     }
 }
 
@@ -78,7 +83,7 @@ mod tests {
         let domain = Domain::cuboid([0.0; 3], [1.0; 3]);
         let settings = RenderSettings { tone_map: [1.0, 0.5, 1.0], background: [0.25; 3], ..RenderSettings::default() };
         let scene = Scene::assemble(&domain, Some(camera), Some(light), Some(transfer), settings, 0);
-        let bar = ColorBar::new(&Renderer::new(scene, &domain, 1.0).unwrap(), [2.0, 6.0], "s");
+        let bar = ColorBar::new(&Renderer::new(scene, &domain, 1.0).unwrap(), Method::Reference, [2.0, 6.0], "s");
         for (i, found) in bar.colors.iter().enumerate() {
             let ramp = i as f64 / (COLORS - 1) as f64;
             let depth = 3.0 * ramp;

@@ -23,7 +23,7 @@ use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::progress;
-use crate::render::{MAX_FRAMES_UNTIL, Method, RenderError, RenderSettings, Renderer, Scene, Target};
+use crate::render::{MAX_FRAMES_UNTIL, RenderError, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
@@ -442,7 +442,7 @@ impl<'a> Run<'a> {
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
-        let color_bar = Arc::new(ColorBar::new(&renderer, [range.0, range.1], &plan.time_unit));
+        let color_bar = Arc::new(ColorBar::new(&renderer, scene.render.method, [range.0, range.1], &plan.time_unit));
         let pixels = [scene.render.width, scene.render.height];
         let for_picture = scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain);
         let mut because = "256 along the longest edge, or 128 below a network".to_owned();
@@ -471,14 +471,14 @@ impl<'a> Run<'a> {
             VelocitySource::Analytic(..) => None,
         };
         let settings = settings.unwrap_or(for_picture);
-        let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
+        let sized = scene.render.method.has_surrogate() && scene.network.size == Size::Auto;
         let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
         let times = Times::new(&scene.network, flow.tau());
         let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
         if !scene.network.inputs.is_empty() {
             buffer.set_now(times.unit(flow.start(), flow.tau()));
         }
-        let has_table = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Network;
+        let has_table = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Network;
         if has_table && scene.surrogate.table_nodes.is_none() && scene.network.size != Size::Auto {
             let nodes = settings.nodes(&plan.domain)?;
             let bytes = nodes.iter().product::<usize>() * size_of::<f32>();
@@ -616,7 +616,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     fn prepare_first(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
-        if self.run.plan.scene.render.method != Method::Reference {
+        if self.run.plan.scene.render.method.has_surrogate() {
             transaction!(self, slide, run, on => run.build_surrogate(on));
         }
         let named = &self.run.plan.scene.training.resume;
@@ -914,7 +914,7 @@ impl Run<'_> {
 
     pub(super) fn draw_color_bar(&mut self) {
         let TransferRecord { low, high, .. } = self.transfer;
-        self.color_bar = Arc::new(ColorBar::new(&self.renderer, [low, high], &self.plan.time_unit));
+        self.color_bar = Arc::new(ColorBar::new(&self.renderer, self.render.method, [low, high], &self.plan.time_unit));
     }
 
     /// Starts a checkpoint if one is due. A disk error fails the checkpoint, not the run.

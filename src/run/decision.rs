@@ -1,6 +1,7 @@
 //! Settings that a scene leaves open, and what was chosen for them.
 
 use super::{Settings, TransferRecord};
+use crate::render::Method;
 use serde::Serialize;
 
 /// A choice for a setting that the scene leaves open. Giving the setting overrides it.
@@ -45,7 +46,11 @@ impl std::fmt::Display for Decision {
 pub(super) fn enter_colours(scene: &Settings, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
     let given = scene.transfer.clone().unwrap_or_default();
     if given.low.is_none() {
-        Decision::new("transfer.low", chosen.low, "median of the FTLE over the domain").enter(decisions);
+        let why = match scene.render.method {
+            Method::Map => "0, or the first percentile of the FTLE over the domain if that is negative or above half of the upper end",
+            _ => "median of the FTLE over the domain",
+        };
+        Decision::new("transfer.low", chosen.low, why).enter(decisions);
     }
     if given.high.is_none() {
         let why = "99.5th percentile of the FTLE over the domain, or just above transfer.low where the FTLE hardly varies";

@@ -15,7 +15,7 @@ use crate::field::Domain;
 use crate::flow::VelocitySource;
 use crate::progress;
 use crate::render::smooth::AUDIT_PAIRS;
-use crate::render::{Combine, Method};
+use crate::render::{Combine, MAP_TONE, Method};
 use crate::surrogate::{Learned, Predict, Trace};
 use crate::trust::{Gate, Strata};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -54,12 +54,12 @@ impl Run<'_> {
         let scene = &self.plan.scene;
         let method = self.render.method;
         let gate = match method {
-            Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto => self.learning.trust.gate(),
-            Method::Reference => Gate::uniform(false),
+            Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto | Method::Default => self.learning.trust.gate(),
+            Method::Reference | Method::Map => Gate::uniform(false),
             Method::Surrogate => Gate::uniform(true),
         };
         // The frame is rendered with frozen weights, which were not trained on its samples.
-        let serves = on.surrogate.as_ref().filter(|_| method != Method::Reference);
+        let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
         let frozen = serves.map(Surrogate::freeze).transpose()?;
         let renderer = self.renderer.clone();
         let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
@@ -142,8 +142,9 @@ impl Run<'_> {
         Ok(Frame {
             record: Arc::new(record),
             film: Arc::new(work.rendered.film),
-            tone_map: scene.render.tone_map,
+            tone_map: if method == Method::Map { MAP_TONE } else { scene.render.tone_map },
             color_bar: Some(Arc::clone(&self.color_bar)),
+            gate: frozen.is_some().then(|| Arc::new(gate)),
         })
     }
 
@@ -158,7 +159,7 @@ impl Run<'_> {
     ) -> Result<Work<B::Samples>, RunEnd> {
         self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
         let method = self.render.method;
-        let (serves, is_smooth) = (method != Method::Reference, method.is_smooth());
+        let (serves, is_smooth) = (method.has_surrogate(), method.is_smooth());
         let learns = serves && on.surrogate.as_ref().is_some_and(Surrogate::learns);
         // A smooth picture measures its own error, so that labels of a table have no use.
         let needs_labels = serves && (learns || !is_smooth);
@@ -218,6 +219,7 @@ impl Run<'_> {
                 picture: number,
                 samples: samples_per_pixel,
                 smooth,
+                is_map: method == Method::Map,
                 progress: Some(&report),
                 stop: abandon,
             };
@@ -292,7 +294,7 @@ impl Run<'_> {
         let settings = &self.plan.scene.training;
         let (Some(_), None) = (slides.is_awaited(), settings.steps_per_frame) else { return Ok(()) };
         let is_awaited = || slides.is_awaited() == Some(true);
-        let serves = self.render.method != Method::Reference;
+        let serves = self.render.method.has_surrogate();
         let Some(surrogate) = on.surrogate.as_mut().filter(|surrogate| serves && surrogate.learns() && !self.learning.buffer.is_empty())
         else {
             return Ok(());

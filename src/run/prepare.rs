@@ -115,8 +115,14 @@ impl Run<'_> {
         let unit = &self.plan.time_unit;
         let per = if unit.is_empty() { "per time".to_owned() } else { format!("/{unit}") };
         let given = self.plan.scene.transfer.as_ref().is_some_and(|transfer| transfer.low.is_some() && transfer.high.is_some());
-        let why = if given { "as set" } else { "as far as not set: median and 99.5th percentile over the domain at the first slide" };
-        format!("colours from FTLE {low:.3e} to {high:.3e} {per} ({why}), extinction {extinction:.3e}")
+        let is_map = self.render.method == Method::Map;
+        let why = match (given, is_map) {
+            (true, _) => "as set",
+            (false, true) => "as far as not set: 0 or a low percentile, and the 99.5th over the domain at the first slide",
+            (false, false) => "as far as not set: median and 99.5th percentile over the domain at the first slide",
+        };
+        let extinction = if is_map { String::new() } else { format!(", extinction {extinction:.3e}") };
+        format!("colours from FTLE {low:.3e} to {high:.3e} {per} ({why}){extinction}")
     }
 
     /// Warning for colours that are scaled to an FTLE that hardly varies; `None` otherwise.
@@ -142,15 +148,18 @@ impl Run<'_> {
             .learning
             .times
             .starts
-            .filter(|_| self.plan.scene.render.method != Method::Reference && !self.learning.times.covers_start(start))?;
+            .filter(|_| self.plan.scene.render.method.has_surrogate() && !self.learning.times.covers_start(start))?;
         Some(format!(
             "start time {start} lies beyond network.start_range, {first} to {last}: the network uses the nearer end, and labels of other windows are not kept"
         ))
     }
 
     /// Traces some points per cell before the first frame of a slide. They tighten the majorants, and their residuals build up trust without
-    /// tracing a whole frame. Since they decide the gate, the stated error does not use them; it uses audit points only.
+    /// tracing a whole frame. Since they decide the gate, the stated error does not use them; it uses audit points only. A map has neither.
     pub(super) fn probe<B: Backend>(&mut self, on: &mut On<B>, slide: u64) -> Result<(), RunEnd> {
+        if self.render.method == Method::Map {
+            return Ok(());
+        }
         let scene = &self.plan.scene;
         let per_cell = scene.trust.min_samples.ceil() as usize;
         let strata = Strata::even(self.learning.trust.shape(), per_cell as u32);
@@ -177,8 +186,11 @@ impl Run<'_> {
     }
 
     /// Renders a picture of one sample per pixel, traced and not shown, to tighten the majorants. A new renderer uses the largest majorant
-    /// everywhere, which costs several times as many queries.
+    /// everywhere, which costs several times as many queries. A map has none.
     pub(super) fn pilot<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        if self.render.method == Method::Map {
+            return Ok(());
+        }
         let gate = Gate::uniform(false);
         let routing = Routing { gate: &gate, trace_budget: None, keep: self.labels_per_frame(on), extras: self.label_extras() };
         let On { backend, tracer, .. } = &mut *on;
@@ -189,6 +201,7 @@ impl Run<'_> {
             picture: PILOT_PICTURE,
             samples: 1.0,
             smooth: None,
+            is_map: false,
             progress: None,
             stop: self.stop,
         };

@@ -45,7 +45,7 @@ pub struct FrameRecord {
     pub commands: Vec<Command>,
     /// `forward` or `backward`.
     pub direction: String,
-    /// `reference`, `surrogate`, `gated`, `marched` or `two_level`.
+    /// `map`, `reference`, `surrogate`, `gated`, `marched` or `two_level`.
     pub method: String,
     /// Device that traces: `cpu`, or `cuda:N` with its name.
     #[serde(default)]
@@ -54,7 +54,7 @@ pub struct FrameRecord {
     pub surrogate: Option<String>,
     /// Width and height in pixels.
     pub size: [usize; 2],
-    /// Samples a pixel of this frame; for `two_level` the mean number of coupled samples.
+    /// Samples a pixel of this frame; for `two_level` the mean number of coupled samples, for `map` seeds, before they are rounded up to an even number.
     pub samples_per_pixel: f64,
     /// Log-stretch queries of the renderer.
     pub queries: u64,
@@ -131,10 +131,10 @@ pub struct DomainRecord {
 }
 
 /// Transfer function. By default `low` and `high` are the median and the 99.5th percentile of the FTLE on stratified points of the domain at the
-/// first slide.
+/// first slide; of a map `low` is 0 or a low percentile.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
 pub struct TransferRecord {
-    /// FTLE (1/time) at which extinction begins.
+    /// FTLE (1/time) at which extinction begins; of a map, the colours.
     pub low: f64,
     /// FTLE (1/time) from which extinction is full.
     pub high: f64,
@@ -206,4 +206,6 @@ pub struct Frame {
     pub tone_map: [f64; 3],
     /// Colours of the transfer function.
     pub color_bar: Option<std::sync::Arc<super::ColorBar>>,
+    /// Cells in which the surrogate was trusted; `None` without a surrogate.
+    pub gate: Option<std::sync::Arc<crate::trust::Gate>>,
 }

@@ -6,7 +6,7 @@ use super::slides::Slide;
 use super::stop::{RunEnd, check_stop};
 use crate::backend::{Interruptible, audit, stratified_points};
 use crate::flow::Extras;
-use crate::render::{Scene, TransferSettings};
+use crate::render::{Method, Scene, TransferSettings};
 use crate::surrogate::Trace;
 use crate::trust::Strata;
 use std::sync::atomic::AtomicBool;
@@ -47,7 +47,7 @@ pub(super) fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &Ato
                 when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
             }));
         }
-        return Ok(transfer.scaled_to(&ftle));
+        return Ok(if file.render.method == Method::Map { transfer.scaled_to_map(&ftle) } else { transfer.scaled_to(&ftle) });
     }
     Ok(transfer)
 }

@@ -4,17 +4,18 @@ use super::decision::Decision;
 use super::default_tau::default_tau;
 use super::settings::with_ends;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
-use super::{RunError, Settings, TimeSettings, TimeSpan, memory};
+use super::{RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
-use crate::render::{Method, Renderer, Scene};
+use crate::render::{Combine, Method, Renderer, Scene, TransferSettings};
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
 use crate::source::{
     DEFAULT_READ_AHEAD, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, duration, window_snapshots,
 };
-use crate::surrogate::Kind;
-use crate::surrogate::network::Input;
+use crate::surrogate::network::{Input, NetworkSettings};
+use crate::surrogate::{Kind, SurrogateSettings};
+use crate::trust::TrustSettings;
 
 /// A scene with all open settings (tau, direction, boundary, domain) chosen.
 #[derive(Debug, Clone)]
@@ -176,6 +177,7 @@ impl Setup {
             (_, _, Some(grid)) => grid.domain(),
             _ => return Err(no_domain()),
         };
+        settle_method(&mut scene, &domain, &mut decisions)?;
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
         }
@@ -198,8 +200,8 @@ impl Setup {
             (map.tau, scene.time.tau) = (tau, Some(TimeSpan::Number(tau)));
         }
         let tau = map.tau;
-        if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
-            notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
+        if scene.training.resume.is_some() && (!scene.render.method.has_surrogate() || scene.surrogate.kind == Kind::Table) {
+            notes.push("training.resume is ignored: methods reference and map, and tables, cannot resume from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let georeference = snapshots.as_ref().map(|s| s.georeference()).unwrap_or_default();
@@ -220,6 +222,45 @@ impl Setup {
         let time_unit = unit.unwrap_or_default();
         Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes, decisions })
     }
+}
+
+/// Replaces `render.method = "default"`: flows of two dimensions are drawn as maps, unless the scene sets what only volumes have.
+fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Decision>) -> Result<(), Refused> {
+    let is_flat = domain.dimensions == 2;
+    if scene.render.method == Method::Default {
+        let of_volumes = of_volumes(scene);
+        scene.render.method = scene.render.method.or_default(is_flat && of_volumes.is_none());
+        let why = match of_volumes {
+            _ if !is_flat => "the flow has three dimensions".to_owned(),
+            None => "the flow has two dimensions; two_level draws it as a volume".to_owned(),
+            Some(key) => format!("the scene sets {key}, which a map of the flow has not"),
+        };
+        decisions.push(Decision::new("render.method", scene.render.method.name(), why));
+    }
+    if scene.render.method == Method::Map && !is_flat {
+        let accepted = "another method with a flow of three dimensions, of which the command map draws a level";
+        return Err(Refused::new("render.method", "is \"map\"", accepted));
+    }
+    Ok(scene.render.check()?)
+}
+
+/// A key that only a picture of a volume has, if the scene sets one.
+fn of_volumes(scene: &Settings) -> Option<&'static str> {
+    let transfer = scene.transfer.clone().unwrap_or_default();
+    let has_albedo = transfer.albedo != TransferSettings::default().albedo;
+    let set = [
+        (scene.camera.is_some(), "camera"),
+        (scene.light.is_some(), "light"),
+        (transfer.extinction.is_some(), "transfer.extinction"),
+        (has_albedo, "transfer.albedo"),
+        (scene.render.budget.is_some(), "render.budget"),
+        (scene.render.combine != Combine::Shrink, "render.combine"),
+        (scene.surrogate != SurrogateSettings::default(), "surrogate"),
+        (scene.network != NetworkSettings::default(), "network"),
+        (scene.training != TrainingSettings::default(), "training"),
+        (scene.trust != TrustSettings::default(), "trust"),
+    ];
+    set.into_iter().find(|(is_set, _)| *is_set).map(|(_, key)| key)
 }
 
 /// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.

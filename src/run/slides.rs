@@ -5,7 +5,7 @@ use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
-use crate::progress;
+use crate::progress::{self, Work};
 use crate::setting::{Refused, shown};
 use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
@@ -192,6 +192,7 @@ impl Slides for ArchiveSlides {
         let start = Instant::now();
         let mut warnings = Vec::new();
         let Self { reader, window, taken, .. } = self;
+        let work = Work::begin("reading the window");
         while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
             let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
             let news = reader.news();
@@ -206,8 +207,12 @@ impl Slides for ArchiveSlides {
                 Err(fault) => warnings.push(fault.to_string()),
             }
             *taken += usize::from(window.newest() != newest);
+            if let (false, Some(oldest), Some(newest)) = (window.is_full(), window.oldest(), window.newest()) {
+                work.reached((1e6 * (newest - oldest) / window.span()) as usize, 1_000_000);
+            }
         }
         *taken = 0;
+        drop(work);
         let time = seed_time(window, self.direction)?;
         let velocity = VelocitySource::Window(Arc::new(window.clone()));
         Ok(Some(Slide {

@@ -71,7 +71,7 @@ impl Change {
 
 /// Most steps of a given length that a command may ask for.
 const MAX_STEPS: f64 = 1e6;
-const METHODS: &str = "reference, surrogate, gated, marched or two_level";
+const METHODS: &str = "map (two dimensions), reference, surrogate, gated, marched or two_level";
 
 /// A command that took effect.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -161,7 +161,7 @@ impl Steering {
                 Steps::Fixed(steps) => steps as f64 / plan.map.tau,
                 _ => 0.0,
             },
-            learns_times: scene.render.method != Method::Reference && !scene.network.inputs.is_empty(),
+            learns_times: scene.render.method.has_surrogate() && !scene.network.inputs.is_empty(),
             state: Mutex::new(State::new(&scene.render, plan.map.tau, plan.map.direction)),
             render: scene.render.clone(),
             changed: Condvar::new(),
@@ -221,7 +221,7 @@ impl Steering {
                 }
                 "render.method" => {
                     let method = read(key, value, METHODS)?;
-                    require(method != Method::Auto, key, value, METHODS)?;
+                    require(!matches!(method, Method::Auto | Method::Default), key, value, METHODS)?;
                     self.check_method(method)?;
                     change.method = Some(method);
                 }
@@ -291,9 +291,14 @@ impl Steering {
 
     /// Refuses a method that this run cannot take.
     fn check_method(&self, method: Method) -> Result<(), Refused> {
-        if self.render.method == Method::Reference && method != Method::Reference {
-            let found = format!("is \"{}\", and this run has no surrogate, since it began with \"reference\"", method.name());
-            return Err(Refused::new("render.method", found, "\"reference\"; another run may begin with another method"));
+        let began = self.render.method;
+        if !began.has_surrogate() && method.has_surrogate() {
+            let found = format!("is \"{}\", and this run has no surrogate, since it began with \"{}\"", method.name(), began.name());
+            let accepted = if self.dimensions == 2 { "\"map\" or \"reference\"" } else { "\"reference\"" };
+            return Err(Refused::new("render.method", found, format!("{accepted}; another run may begin with another method")));
+        }
+        if method == Method::Map && self.dimensions != 2 {
+            return Err(Refused::new("render.method", "is \"map\", and the flow has three dimensions", "another method"));
         }
         drawn_by(&self.render, method, None).check().map_err(Refused::from)
     }
@@ -327,7 +332,7 @@ impl Steering {
 
 /// Settings of the picture with another method: without what only other methods have.
 pub(super) fn drawn_by(render: &RenderSettings, method: Method, budget: Option<f64>) -> RenderSettings {
-    let (budget, until) = (budget.filter(|_| method == Method::TwoLevel), render.until.filter(|_| method.is_smooth()));
+    let (budget, until) = (budget.filter(|_| method == Method::TwoLevel), render.until.filter(|_| method.accumulates()));
     RenderSettings { method, budget, until, ..render.clone() }
 }
 
@@ -348,7 +353,7 @@ mod tests {
     use serde_json::json;
 
     fn steering() -> Steering {
-        steering_of(&RenderSettings::default())
+        steering_of(&RenderSettings { method: Method::TwoLevel, ..RenderSettings::default() })
     }
 
     fn steering_of(render: &RenderSettings) -> Steering {
@@ -399,8 +404,11 @@ mod tests {
             (json!({"time.tau": 0}), "`time.tau` is 0.0; accepted: a number above 0"),
             (json!({"time.tau": "1 day"}), "`time.tau` is \"1 day\"; accepted: a number above 0"),
             (json!({"render.width": 64}), "`render.width` cannot change during a run; accepted: camera"),
-            (json!({"render.method": "auto"}), "`render.method` is \"auto\"; accepted: reference, surrogate, gated, marched or two_level"),
-            (json!({"render.method": "exact"}), "`render.method` is \"exact\"; accepted: reference, surrogate"),
+            (
+                json!({"render.method": "auto"}),
+                "`render.method` is \"auto\"; accepted: map (two dimensions), reference, surrogate, gated, marched or two_level",
+            ),
+            (json!({"render.method": "exact"}), "`render.method` is \"exact\"; accepted: map (two dimensions), reference, surrogate"),
             (json!({"render.budget": 0.01}), "`render.budget` is 0.01; accepted: milliseconds, 0.1 to 600000"),
             (json!({"render.budget": "fast"}), "`render.budget` is \"fast\"; accepted: milliseconds"),
             (
@@ -448,8 +456,19 @@ mod tests {
             assert!(error.starts_with(&hint), "{error}");
         }
         assert_eq!(command(&traced, json!({"render.method": "reference"})).unwrap().commands, 1);
+        assert_eq!(command(&traced, json!({"render.method": "map"})).unwrap().method, Method::Map);
+        let mut map = steering_of(&RenderSettings { method: Method::Map, ..RenderSettings::default() });
+        let error = command(&map, json!({"render.method": "gated"})).unwrap_err();
+        assert!(
+            error.ends_with("since it began with \"map\"; accepted: \"map\" or \"reference\"; another run may begin with another method"),
+            "{error}"
+        );
+        assert!(command(&map, json!({"render.budget": 20})).unwrap_err().contains("with render.method = \"map\""));
+        map.dimensions = 3;
+        assert!(command(&map, json!({"render.method": "map"})).unwrap_err().contains("and the flow has three dimensions"));
         // A share of a sample is something for smooth pictures only; their target is left out.
-        let render = RenderSettings { samples: 0.5, until: Some("40dB".to_owned().try_into().unwrap()), ..RenderSettings::default() };
+        let (method, until) = (Method::TwoLevel, Some("40dB".to_owned().try_into().unwrap()));
+        let render = RenderSettings { method, samples: 0.5, until, ..RenderSettings::default() };
         let error = command(&steering_of(&render), json!({"render.method": "gated"})).unwrap_err();
         assert!(error.contains("`render.samples` is 0.5; accepted: a whole number"), "{error}");
         let smooth = steering_of(&RenderSettings { samples: 2.0, budget: Some(40.0), ..render });

@@ -3,7 +3,6 @@
 use super::{RunError, Settings, TrainingSettings};
 use crate::backend::DeviceError;
 use crate::progress;
-use crate::render::Method;
 use crate::surrogate::{Kind, Learned};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -20,7 +19,7 @@ pub(super) struct Threads {
 impl Threads {
     /// Splits the threads: `training.share` of them train, at least one. A single thread alternates between rendering and training.
     pub(super) fn new(threads: usize, scene: &Settings) -> Result<Self, RunError> {
-        let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
+        let learns = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Table;
         let share = scene.training.share;
         let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
         let pool = |n: usize, name: &'static str| {

@@ -165,7 +165,8 @@ fn smooth_pictures_of_a_flat_archive_have_a_table_as_fine_as_they_are() {
     let file = eddy(folder.path());
     let stated = |name: &str, keys: &[&str]| {
         let run = folder.path().join(name);
-        let common = ["time.tau=6 days", "time.slides=1", "render.samples=8", "transfer.low=1e-6", "transfer.high=5e-6"];
+        let common =
+            ["render.method=two_level", "time.tau=6 days", "time.slides=1", "render.samples=8", "transfer.low=1e-6", "transfer.high=5e-6"];
         replay(text(&file), &run, &set(&[&common, keys].concat()));
         (summary(&run)["run"]["surrogate_bytes"].as_u64().unwrap(), records(&run)[0].picture_error.unwrap().rms.value)
     };
@@ -310,7 +311,7 @@ fn adaptive_paths_have_no_number_of_steps() {
 fn what_is_chosen_is_in_the_summary_with_its_reason_and_can_be_given() {
     let folder = tempfile::tempdir().unwrap();
     let file = eddy(folder.path());
-    let small = ["render.width=32", "render.height=16", "time.slides=1", "publish.maps=false"];
+    let small = ["render.method=two_level", "render.width=32", "render.height=16", "time.slides=1", "publish.maps=false"];
     let decisions = |name: &str, keys: &[&str]| {
         let run = folder.path().join(name);
         let keys = set(&[&small[..], keys].concat());

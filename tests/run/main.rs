@@ -8,6 +8,7 @@ mod default_tau;
 mod export;
 #[path = "../kit/mod.rs"]
 mod kit;
+mod maps;
 mod messages;
 mod movie;
 #[path = "../network_support/mod.rs"]

@@ -269,6 +269,35 @@ fn a_method_is_in_effect_on_the_next_frame() {
     }
 }
 
+/// Seeds go on counting under other colours, and a new view begins anew. The map takes the place of other methods, and gives it back.
+#[test]
+fn a_map_is_steered() {
+    let (low, high) = (0.02, 0.3);
+    let (frames, report) = steered(scene("time.frames_per_slide = 7\nrender.method = \"two_level\"\n"), |steering, frame| {
+        match frame.record.frame {
+            0 => command(steering, json!({"render.method": "map"})),
+            2 => command(steering, json!({"transfer": {"low": low, "high": high}})),
+            3 => command(steering, json!({"camera": serde_json::from_str::<Value>(CAMERA).unwrap()})),
+            5 => command(steering, json!({"render.method": "two_level"})),
+            _ => {}
+        }
+        false
+    });
+    assert!(frames.len() == 7 && report.warnings.is_empty(), "{:?}", report.warnings);
+    let methods: Vec<&str> = frames.iter().map(|frame| frame.record.method.as_str()).collect();
+    assert_eq!(methods, ["two_level", "map", "map", "map", "map", "map", "two_level"]);
+    let seeds: Vec<f64> = frames[1..6].iter().map(|frame| frame.record.picture_error.unwrap().samples_per_pixel).collect();
+    assert_eq!(seeds, [4.0, 8.0, 12.0, 4.0, 8.0], "colours keep the seeds, a camera does not");
+    assert_eq!((frames[3].record.transfer.low, frames[3].record.transfer.high), (low, high));
+    let bar = frames[3].color_bar.as_ref().unwrap();
+    assert_eq!((bar.low, bar.high, bar.colors[0], bar.colors[31]), (low, high, [68, 1, 84], [253, 231, 37]), "viridis");
+    // The value at a pixel stays, its colour does not.
+    let pixel = 12 * 48 + 20;
+    let value = |frame: usize| frames[frame].film.ftle_mean[pixel];
+    assert!((value(3) - value(2)).abs() < 0.1 * value(2).abs() && frames[3].film.rgba[pixel] != frames[2].film.rgba[pixel]);
+    assert_ne!(frames[4].film.ftle_mean, frames[3].film.ftle_mean);
+}
+
 #[test]
 fn a_budget_gives_the_next_frame_its_samples() {
     let keys = "time.frames_per_slide = 7\nrender.method = \"two_level\"\nsurrogate.refine = false\n";

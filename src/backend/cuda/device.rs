@@ -168,7 +168,7 @@ impl Backend for Cuda {
             Some(CudaFrozen::Resident(frozen)) => Some(frozen),
             Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer, &mut picture.host),
         };
-        if self.placement.frames == Place::Host || job.routing.extras.jacobian {
+        if self.placement.frames == Place::Host || job.routing.extras.jacobian || job.is_map {
             return self.render_on_cpu(job, renderer, &mut picture.host);
         }
         self.frames()?.render(job, resident, renderer, picture.numbers)

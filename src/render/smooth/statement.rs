@@ -45,7 +45,8 @@ impl MarchError {
     }
 }
 
-/// Stated error of a picture, against the picture of the traced field without noise.
+/// Stated error of a picture, against the picture of the traced field without noise. Of a map, radiance is the FTLE's place in the range of the colours
+/// (0 to 1), lit pixels are those with a value, and samples are seeds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PictureError {
     /// Root mean square over lit pixels and channels, linear radiance.
@@ -58,7 +59,7 @@ pub struct PictureError {
     pub psnr_all: ErrorEstimate,
     /// Root mean square of the error of marching alone, linear radiance. It is part of the errors above.
     pub march_rms: f64,
-    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"` on the CPU.
+    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"` on the CPU. The FTLE of a map is unbiased.
     pub unbiased: bool,
     /// Coupled samples per pixel since the picture started anew.
     pub samples_per_pixel: f64,
