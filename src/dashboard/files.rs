@@ -21,10 +21,12 @@ const STYLE: &str = "text/css; charset=utf-8";
 pub(super) const PAGE: File = file!("index.html", "text/html; charset=utf-8");
 
 const FILES: &[File] = &[
+    file!("axes.js", SCRIPT),
     file!("camera.js", SCRIPT),
     file!("charts.js", SCRIPT),
     file!("colour_bar.js", SCRIPT),
     file!("connection.js", SCRIPT),
+    file!("graticule.js", SCRIPT),
     file!("histogram.js", SCRIPT),
     file!("history.js", SCRIPT),
     file!("overlay.js", SCRIPT),

@@ -2,7 +2,7 @@
 
 use super::access::parameter;
 use super::planes::MAX_PLANES;
-use crate::publish::{NewestFrame, NoFrame, channels_at, encode_exr, no_error, png};
+use crate::publish::{NewestFrame, NoFrame, NoMapField, channels_at, encode_exr, no_error, png};
 use crate::run::Frame;
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -11,12 +11,14 @@ use bytes::Bytes;
 use serde::Serialize;
 use serde_json::{Map, Value};
 use std::sync::Arc;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
 
 /// Maximum number of pixels of a picture that is encoded here: an EXR of some 700 MB before compression.
 const MAX_PIXELS: usize = 1 << 24;
 /// Files that are encoded or on their way at once. Each may be large.
 const MAX_DOWNLOADS: usize = 1;
+/// Lossless pictures on their way at once, most of them the same one.
+const MAX_PICTURES: usize = 64;
 
 const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
 
@@ -35,6 +37,9 @@ pub(super) enum Kept<'a> {
 pub(super) struct Pixels {
     newest: Option<Arc<NewestFrame>>,
     downloads: Arc<Semaphore>,
+    /// The latest picture that was encoded without loss, for all pages that ask for it.
+    lossless: Mutex<Option<(u64, Bytes)>>,
+    pictures: Arc<Semaphore>,
     pub(super) planes: Arc<Semaphore>,
 }
 
@@ -44,6 +49,7 @@ pub(super) enum File {
     Exr,
     Png,
     Record,
+    NetCdf,
 }
 
 /// A request that is not met: status and words.
@@ -70,7 +76,7 @@ impl<T: AsRef<[u8]>> AsRef<[u8]> for Sent<T> {
 impl File {
     /// The file that a path asks for.
     pub fn named(path: &str) -> Option<Self> {
-        let files = [("/frame.exr", Self::Exr), ("/frame.png", Self::Png), ("/frame.json", Self::Record)];
+        let files = [("/frame.exr", Self::Exr), ("/frame.png", Self::Png), ("/frame.json", Self::Record), ("/frame.nc", Self::NetCdf)];
         files.into_iter().find(|(end, _)| path.ends_with(end)).map(|(_, file)| file)
     }
 
@@ -80,21 +86,28 @@ impl File {
             Self::Exr => ("exr", "image/x-exr"),
             Self::Png => ("png", "image/png"),
             Self::Record => ("json", "application/json"),
+            Self::NetCdf => ("nc", "application/netcdf"),
         }
     }
 
-    fn encode(self, frame: &Frame) -> Result<Vec<u8>, String> {
+    fn encode(self, frame: &Frame, newest: &NewestFrame) -> Result<Vec<u8>, Refusal> {
+        let system = |error: String| (StatusCode::INTERNAL_SERVER_ERROR, error);
         match self {
-            Self::Exr => encode_exr(&frame.film, Some(&frame.record)),
-            Self::Png => png(&frame.film, frame.tone_map).map_err(|error| error.to_string()),
-            Self::Record => serde_json::to_vec_pretty(&*frame.record).map_err(|error| error.to_string()),
+            Self::Exr => encode_exr(&frame.film, Some(&frame.record)).map_err(system),
+            Self::Png => png(&frame.film, frame.tone_map).map_err(|error| system(error.to_string())),
+            Self::Record => serde_json::to_vec_pretty(&*frame.record).map_err(|error| system(error.to_string())),
+            Self::NetCdf => newest.netcdf(frame).map_err(|error| match error {
+                NoMapField::NoField(why) => (StatusCode::NOT_FOUND, why),
+                NoMapField::System(error) => system(error),
+            }),
         }
     }
 }
 
 impl Pixels {
     pub fn new(newest: Option<Arc<NewestFrame>>) -> Self {
-        Self { newest, downloads: Arc::new(Semaphore::new(MAX_DOWNLOADS)), planes: Arc::new(Semaphore::new(MAX_PLANES)) }
+        let [downloads, pictures, planes] = [MAX_DOWNLOADS, MAX_PICTURES, MAX_PLANES].map(|most| Arc::new(Semaphore::new(most)));
+        Self { newest, downloads, lossless: Mutex::default(), pictures, planes }
     }
 
     pub fn kept(&self) -> Kept<'_> {
@@ -132,6 +145,8 @@ impl Pixels {
             channels: Map<String, Value>,
             /// Of `ftle.mean`.
             unit: &'a str,
+            /// Method of the frame: the error of a `map` is that of its FTLE.
+            method: &'a str,
             /// Why there is no error.
             #[serde(skip_serializing_if = "Option::is_none")]
             no_error: Option<String>,
@@ -149,7 +164,8 @@ impl Pixels {
         let channels: Map<String, Value> =
             channels_at(&film, [x, y]).into_iter().map(|(name, value)| (name.to_owned(), value.into())).collect();
         let unit = color_bar.as_ref().map_or("", |bar| bar.unit.as_str());
-        let values = Values { frame: record.frame, slide: record.slide, x, y, size: record.size, channels, unit, no_error };
+        let values =
+            Values { frame: record.frame, slide: record.slide, x, y, size: record.size, channels, unit, method: &record.method, no_error };
         serde_json::to_string(&values).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
     }
 
@@ -158,9 +174,28 @@ impl Pixels {
         self.encoded(file, uri).await.unwrap_or_else(refused)
     }
 
+    async fn encode(&self, file: File, frame: &Frame) -> Result<Bytes, Refusal> {
+        let (frame, newest) = (frame.clone(), self.newest.clone());
+        let encode = move || newest.ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned())).and_then(|newest| file.encode(&frame, &newest));
+        let failed = |error: tokio::task::JoinError| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string());
+        Ok(tokio::task::spawn_blocking(encode).await.map_err(failed)??.into())
+    }
+
+    /// The picture without loss. It is encoded once, whoever asks: idle pages all do.
+    async fn lossless(&self, frame: &Frame) -> Result<Bytes, Refusal> {
+        let mut latest = self.lossless.lock().await;
+        if let Some((_, bytes)) = latest.as_ref().filter(|(number, _)| *number == frame.record.frame) {
+            return Ok(bytes.clone());
+        }
+        let bytes = self.encode(File::Png, frame).await?;
+        *latest = Some((frame.record.frame, bytes.clone()));
+        Ok(bytes)
+    }
+
     async fn encoded(&self, file: File, uri: &Uri) -> Result<Response, Refusal> {
         let busy = |_| (StatusCode::SERVICE_UNAVAILABLE, "another file is on its way: try again when it has arrived".to_owned());
-        let permit = Arc::clone(&self.downloads).try_acquire_owned().map_err(busy)?;
+        let permits = if matches!(file, File::Png) { &self.pictures } else { &self.downloads };
+        let permit = Arc::clone(permits).try_acquire_owned().map_err(busy)?;
         let (frame, run) = self.frame(uri)?;
         let pixels = frame.film.width * frame.film.height;
         if pixels > MAX_PIXELS {
@@ -169,9 +204,12 @@ impl Pixels {
         }
         let (ending, media_type) = file.form();
         let name = format!("{run}-frame-{:06}-slide-{:04}.{ending}", frame.record.frame, frame.record.slide);
-        let encoded = tokio::task::spawn_blocking(move || file.encode(&frame)).await;
-        let failed = |error: String| (StatusCode::INTERNAL_SERVER_ERROR, format!("{name} cannot be made: {error}"));
-        let bytes = encoded.map_err(|error| failed(error.to_string()))?.map_err(failed)?;
+        let failed = |(status, error): Refusal| (status, format!("{name} cannot be made: {error}"));
+        let bytes = match file {
+            File::Png => self.lossless(&frame).await,
+            _ => self.encode(file, &frame).await,
+        };
+        let bytes = bytes.map_err(failed)?;
         let disposition = format!("attachment; filename=\"{name}\"");
         Ok(([(CONTENT_TYPE, media_type.to_owned()), (CONTENT_DISPOSITION, disposition)], Bytes::from_owner(Sent::new(bytes, permit)))
             .into_response())

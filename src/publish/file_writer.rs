@@ -297,7 +297,7 @@ mod tests {
     fn frame(number: u64, edge: usize) -> Frame {
         let film = Film { width: edge, height: edge, rgba: vec![[0.5; 4]; edge * edge], ..Default::default() };
         let record = FrameRecord { frame: number, slide: number, ..Default::default() };
-        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None }
+        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None }
     }
 
     fn recorded(folder: &std::path::Path) -> Vec<u64> {

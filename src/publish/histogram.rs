@@ -58,7 +58,7 @@ mod tests {
     fn of(ftle_mean: Vec<f32>) -> Histogram {
         let film = Film { width: ftle_mean.len(), height: 1, ftle_mean, ..Film::default() };
         let record = FrameRecord { frame: 3, ..Default::default() };
-        histogram(&Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None })
+        histogram(&Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None })
     }
 
     #[test]

@@ -219,7 +219,7 @@ mod tests {
     fn frame(edge: usize, red: f32) -> Frame {
         let rgba = (0..edge * edge).map(|i| [red, (i % 997) as f32 / 997.0, (i % 61) as f32 / 61.0, 1.0]).collect();
         let film = Film { width: edge, height: edge, rgba, ..Default::default() };
-        Frame { record: Arc::new(FrameRecord::default()), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None }
+        Frame { record: Arc::new(FrameRecord::default()), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None }
     }
 
     fn settings(path: PathBuf, waits: bool) -> MovieSettings {

@@ -1,5 +1,6 @@
 //! The newest frame of a run in memory, for those who ask about its pixels or want it as a file.
 
+use super::export::{MapAbout, NoMapField, map_netcdf};
 use crate::run::Frame;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -8,6 +9,7 @@ use std::sync::{Mutex, PoisonError};
 #[derive(Debug)]
 pub struct NewestFrame {
     run: String,
+    about: MapAbout,
     frame: Mutex<Option<Frame>>,
 }
 
@@ -27,16 +29,24 @@ pub enum NoFrame {
 
 impl NewestFrame {
     /// Of the run that writes into this folder, whose name goes into the names of files.
-    pub fn new(folder: &Path) -> Self {
+    pub fn new(folder: &Path, about: MapAbout) -> Self {
         let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         // What every file system and a quoted string of HTTP accept.
         let run: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
-        Self { run: if run.is_empty() { "run".to_owned() } else { run }, frame: Mutex::default() }
+        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about, frame: Mutex::default() }
     }
 
     /// Name of the run in names of files: letters, digits, `-`, `_` and `.`.
     pub fn run(&self) -> &str {
         &self.run
+    }
+
+    /// The pixels of a frame, of a map, as NetCDF ([`map_netcdf`]).
+    ///
+    /// # Errors
+    /// Why it is no such field, or what the system refuses.
+    pub fn netcdf(&self, frame: &Frame) -> Result<Vec<u8>, NoMapField> {
+        map_netcdf(frame, &self.about, &self.run)
     }
 
     /// Keeps this frame in place of the one before.
@@ -73,14 +83,14 @@ mod tests {
     fn frame(number: u64) -> (Frame, Weak<Film>) {
         let film = Arc::new(Film::new(4, 2));
         let (record, weak) = (FrameRecord { frame: number, ..Default::default() }, Arc::downgrade(&film));
-        (Frame { record: Arc::new(record), film, tone_map: [1.0, 0.5, 1.0], color_bar: None }, weak)
+        (Frame { record: Arc::new(record), film, tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None }, weak)
     }
 
     #[test]
     fn one_frame_is_kept_and_an_earlier_one_is_freed() {
-        let newest = NewestFrame::new(Path::new("out/some run\"1"));
+        let newest = NewestFrame::new(Path::new("out/some run\"1"), MapAbout::default());
         assert_eq!(newest.run(), "some_run_1");
-        assert_eq!(NewestFrame::new(Path::new("..")).run(), "run");
+        assert_eq!(NewestFrame::new(Path::new(".."), MapAbout::default()).run(), "run");
         assert_eq!(newest.get(None).unwrap_err(), NoFrame::NotYet);
         let ((first, film), (second, _)) = (frame(3), frame(4));
         newest.put(first);

@@ -751,7 +751,7 @@ mod tests {
     fn frame(number: u64) -> Frame {
         let film = Film { width: 4, height: 2, rgba: vec![[number as f32, 0.5, 0.25, 1.0]; 8], ..Default::default() };
         let record = FrameRecord { frame: number, slide: number, ..Default::default() };
-        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None }
+        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None }
     }
 
     fn names(folder: &Path) -> Vec<String> {

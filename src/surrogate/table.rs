@@ -6,6 +6,7 @@ use super::network::Field;
 use super::trace::Trace;
 use rayon::prelude::*;
 use ridgewatch_base::DeviceError;
+use ridgewatch_base::progress::Work;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, Traced};
 use std::sync::Arc;
@@ -77,6 +78,7 @@ impl Table {
             self.values = Arc::new(vec![0.0; all]);
         }
         let end = all.min(self.traced.saturating_add(most));
+        let (begin, work) = (self.traced, Work::begin("tracing the table"));
         for values in Arc::make_mut(&mut self.values)[self.traced..end].chunks_mut(TRACE_AT_ONCE) {
             let first = self.traced;
             let seeds: Vec<DomainPoint> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
@@ -87,6 +89,7 @@ impl Table {
                 self.not_finite += usize::from(!traced.is_finite());
             }
             self.traced += values.len();
+            work.reached(self.traced - begin, end - begin);
         }
         Ok(self.traced == all)
     }

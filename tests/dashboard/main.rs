@@ -25,7 +25,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
-use visitor::{LIMIT, Visitor, ask, get, socket_status};
+use visitor::{LIMIT, Received, Visitor, ask, get, socket_status};
 
 const SIZE: [usize; 2] = [48, 32];
 
@@ -278,6 +278,63 @@ fn a_publisher_that_stops_is_silent_within_five_seconds_and_recovers() {
 }
 
 /// Sends until the dashboard subscribes and follows.
+/// Proxies as jupyter-server-proxy end a connection with a message of more than 10 MB.
+#[test]
+fn pictures_keep_messages_below_ten_megabytes() {
+    let stage = Stage::new();
+    let mut visitor = stage.visit();
+    let publisher = raw_publisher(&stage, &mut visitor);
+    let mut longest = 0;
+    for (bytes, is_shown) in [(9_700_000, true), (10_000_000, false), (12_000_000, false)] {
+        let header = json!({"protocol": 3, "frame": bytes, "encoding": "jpeg", "payload_bytes": bytes}).to_string();
+        publisher.send(&[b"frame", header.as_bytes()], vec![7; bytes], Keep::All);
+        if is_shown {
+            let Received { json, payload } = visitor.frame();
+            assert_eq!(payload.len(), bytes);
+            longest = 4 + json.to_string().len() + payload.len();
+        } else {
+            let state = visitor
+                .until_state(|state| state["problem"].as_str().is_some_and(|problem| problem.contains(&format!("of {bytes} bytes"))));
+            assert!(state["problem"].as_str().unwrap().contains("publish.payload"), "{state}");
+        }
+    }
+    assert!((9_700_000..10_000_000).contains(&longest), "{longest}");
+}
+
+/// Opens a WebSocket and then neither reads its messages as such nor answers any.
+fn mute_page(address: SocketAddr, token: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(LIMIT)).unwrap();
+    let head = format!("GET /socket?token={token} HTTP/1.1\r\nHost: {address}\r\nOrigin: http://{address}\r\n");
+    let upgrade =
+        "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
+    stream.write_all(format!("{head}{upgrade}").as_bytes()).unwrap();
+    stream
+}
+
+#[test]
+fn a_page_that_answers_no_ping_is_disconnected_and_one_that_does_stays() {
+    let stage = Stage::new();
+    let mut quiet = stage.visit();
+    let mut mute = mute_page(stage.address(), &stage.token);
+    let watching = std::thread::spawn(move || {
+        let (begin, mut received) = (Instant::now(), Vec::new());
+        mute.read_to_end(&mut received).unwrap();
+        (begin.elapsed(), received)
+    });
+    // Its library answers pings while it reads.
+    let (begin, mut states) = (Instant::now(), 0);
+    while begin.elapsed() < Duration::from_secs(26) {
+        let received = quiet.next_until(Instant::now() + LIMIT).expect("states go on").unwrap();
+        states += u32::from(received.kind() == "state");
+    }
+    assert!(states >= 20, "{states} states in 26 s");
+    let (lasted, received) = watching.join().unwrap();
+    // Ten seconds of silence, ten after the ping, and the next tick.
+    assert!((Duration::from_secs(19)..Duration::from_secs(26)).contains(&lasted), "{lasted:?}");
+    assert!(received.windows(2).any(|frame| frame == [0x89, 0]), "a ping came");
+}
+
 fn raw_publisher(stage: &Stage, visitor: &mut Visitor) -> PubSocket {
     let publisher = PubSocket::bind(&stage.endpoint(), None, Limits { queued: 5000, ..Limits::default() }).unwrap();
     kit::program::until("a subscription", || publisher.is_wanted(b"record") && publisher.is_wanted(b"frame"));

@@ -53,11 +53,11 @@ fn a_plane_has_the_layer_of_the_film() {
     }
     newest.put(frame(13, Film { error: Vec::new(), ..film }));
     let (head, values) = plane(address, token, "of=error");
-    assert_eq!(head["none"], "gated states no error of a pixel; marched and two_level do");
+    assert_eq!(head["none"], "gated states no error of a pixel; map, marched and two_level do");
     assert!(values.is_empty() && head["columns"] == 0 && head["frame"] == 13);
     for (query, status, words) in [
         ("of=error&frame=12&", 410, "frame 12 is no longer kept"),
-        ("of=light&", 400, "`of` is \"light\"; accepted: ftle, error, traced, missing"),
+        ("of=light&", 400, "`of` is \"light\"; accepted: ftle, error, traced, missing, trusted"),
         ("", 400, "`of` is \"\""),
         ("of=ftle&frame=-1&", 400, "`frame` is \"-1\""),
         (&format!("of={}&", "x".repeat(8000)), 400, "`of` is \"xxx"),

@@ -5,9 +5,9 @@ use crate::kit::publishing;
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, ask, get};
 use crate::{LIMIT, Stage};
-use ridgewatch::publish::{NewestFrame, channels_at, decode_exr, png, read_exr};
-use ridgewatch::render::Film;
-use ridgewatch::run::{ColorBar, Frame, FrameRecord};
+use ridgewatch::publish::{MapAbout, NewestFrame, channels_at, decode_exr, png, read_exr};
+use ridgewatch::render::{CameraSettings, Film};
+use ridgewatch::run::{ColorBar, DomainRecord, Frame, FrameRecord};
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -33,7 +33,7 @@ pub fn frame(number: u64, film: Film) -> Frame {
 }
 
 pub fn stage(frame: Option<Frame>) -> (Stage, Arc<NewestFrame>) {
-    let newest = Arc::new(NewestFrame::new(Path::new("out/gulf")));
+    let newest = Arc::new(NewestFrame::new(Path::new("out/gulf"), MapAbout::default()));
     frame.into_iter().for_each(|frame| newest.put(frame));
     (Stage::with(tempfile::tempdir().unwrap(), None, Some(Arc::clone(&newest))), newest)
 }
@@ -119,7 +119,7 @@ fn what_cannot_be_told_is_said_in_words() {
     let (status, answer) = said("/values?x=0&y=0&frame=8&");
     let values: Value = serde_json::from_str(body(&answer)).unwrap();
     assert!(status == 200 && values["channels"].get("error").is_none());
-    assert_eq!(values["no_error"], "gated states no error of a pixel; marched and two_level do");
+    assert_eq!(values["no_error"], "gated states no error of a pixel; map, marched and two_level do");
     // A process of its own has no frames, and its pages know before they ask.
     let alone = Stage::new();
     let state = alone.visit().until_state(|_| true);
@@ -129,12 +129,84 @@ fn what_cannot_be_told_is_said_in_words() {
     assert_eq!(stage.visit().until_state(|_| true)["values"], json!({"ready": "gulf"}));
 }
 
+/// A camera straight above a point, which shows this half-width.
+fn above(x: f64, y: f64, half_width: f64) -> CameraSettings {
+    let (eye, look_at) = ([x, y, 0.2 + half_width], [x, y, 0.2]);
+    CameraSettings { eye, look_at, up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true }
+}
+
+/// A map of [0, 2] x [0, 1].
+fn map_frame(number: u64, size: [usize; 2], camera: CameraSettings) -> Frame {
+    let axes = [["x", ""], ["y", ""]].map(|axis| axis.map(str::to_owned)).to_vec();
+    let domain = DomainRecord { min: [0.0; 3], max: [2.0, 1.0, 0.2], axes };
+    let record = FrameRecord {
+        method: "map".into(),
+        camera: Some(camera),
+        scale: [1.0; 3],
+        domain: Some(domain),
+        direction: "backward".into(),
+        time: 5.0,
+        tau: 2.0,
+        ..(*frame(number, film(size, true)).record).clone()
+    };
+    Frame { record: Arc::new(record), ..frame(number, film(size, true)) }
+}
+
+#[test]
+fn a_map_is_a_field_on_axes() {
+    let (stage, newest) = stage(Some(map_frame(3, [8, 4], above(1.0, 0.5, 1.0))));
+    let (address, token) = (stage.address(), stage.token.clone());
+    let read = || {
+        let (head, found) = bytes(address, &format!("/frame.nc?token={token}"));
+        assert!(head.starts_with("HTTP/1.1 200") && head.contains("slide-0002.nc\""), "{head}: {}", String::from_utf8_lossy(&found));
+        let file = tempfile::Builder::new().suffix(".nc").tempfile().unwrap();
+        std::fs::write(file.path(), found).unwrap();
+        let opened = netcdf::open(file.path()).unwrap();
+        let values = |name: &str| opened.variable(name).unwrap().get_values::<f64, _>(..).unwrap();
+        (["x", "y", "time", "ftle", "ftle_error", "missing_share"].map(values), values("time_bounds"))
+    };
+    let film = film([8, 4], true);
+    let ([x, y, time, ftle, error, missing], bounds) = read();
+    // Centres of pixels, upwards; the film is from the top.
+    // Up to the rounding of the camera.
+    let lie_at =
+        |found: &[f64], wanted: &[f64]| found.len() == wanted.len() && found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-12);
+    assert!(
+        lie_at(&x, &[0.125, 0.375, 0.625, 0.875, 1.125, 1.375, 1.625, 1.875]) && lie_at(&y, &[0.125, 0.375, 0.625, 0.875]),
+        "{x:?} {y:?}"
+    );
+    assert_eq!((time, bounds, missing), (vec![5.0], vec![3.0, 5.0], vec![0.0; 32]));
+    for (i, (ftle, error)) in ftle.iter().zip(&error).enumerate() {
+        let pixel = (3 - i / 8) * 8 + i % 8;
+        assert_eq!(*error, f64::from(film.error[pixel]));
+        // Pixel 1 has no value, and the fill value of NetCDF.
+        assert_eq!(*ftle, if pixel == 1 { 9.969_209_968_386_869e36 } else { f64::from(film.ftle_mean[pixel]) });
+    }
+    // Twice as far away the domain is the middle quarter, and pixels of other places are left out.
+    newest.put(map_frame(4, [8, 4], above(1.0, 0.5, 2.0)));
+    let ([x, y, _, ftle, ..], _) = read();
+    assert!(lie_at(&x, &[0.25, 0.75, 1.25, 1.75]) && lie_at(&y, &[0.25, 0.75]), "{x:?} {y:?}");
+    assert_eq!(ftle[0], f64::from(film.ftle_mean[2 * 8 + 2]));
+    for (camera, words) in [
+        (CameraSettings { up: [1.0, 1.0, 0.0], ..above(1.0, 0.5, 1.0) }, "turned or tilted"),
+        (CameraSettings { eye: [1.0, 0.0, 2.0], orthographic: false, ..above(1.0, 0.5, 1.0) }, "turned or tilted"),
+        (above(9.0, 0.5, 1.0), "no pixel lies in the domain"),
+    ] {
+        newest.put(map_frame(5, [8, 4], camera));
+        let (status, answer) = get(address, &format!("/frame.nc?token={token}"), &[]);
+        assert!(status == 404 && answer.contains(words), "{answer}");
+    }
+    newest.put(frame(6, film));
+    let (status, answer) = get(address, &format!("/frame.nc?token={token}"), &[]);
+    assert!(status == 404 && answer.contains("a picture of a volume"), "{answer}");
+}
+
 #[test]
 fn frames_go_to_those_who_know_a_token() {
-    let (stage, _newest) = stage(Some(frame(1, film([9, 4], true))));
+    let (stage, _newest) = stage(Some(map_frame(1, [8, 4], above(1.0, 0.5, 1.0))));
     let address = stage.address();
     let watching = stage.dashboard.watching_url().split("token=").nth(1).unwrap().to_owned();
-    for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/histogram?", "/frame.exr?", "/frame.png?", "/frame.json?"] {
+    for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/histogram?", "/frame.exr?", "/frame.png?", "/frame.json?", "/frame.nc?"] {
         assert_eq!(get(address, &format!("{target}token={watching}"), &[]).0, 200, "{target}");
         assert_eq!(get(address, &format!("{target}token={}", stage.token), &[]).0, 200, "{target}");
         for wrong in ["", "token=", "token=0", &format!("token={watching}0")] {
@@ -186,8 +258,11 @@ fn one_file_is_on_its_way_at_once() {
     slow.set_read_timeout(Some(LIMIT)).unwrap();
     write!(slow, "GET /frame.exr?token={token} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
     slow.read_exact(&mut [0; 64]).unwrap();
-    let (status, answer) = get(address, &format!("/frame.png?token={token}"), &[]);
+    let (status, answer) = get(address, &format!("/frame.json?token={token}"), &[]);
     assert!(status == 503 && answer.contains("another file is on its way"), "{answer}");
+    // The picture without loss is made once for all pages, and waits for nobody.
+    let [first, second] = [0, 1].map(|_| bytes(address, &format!("/frame.png?token={token}")).1);
+    assert!(first.starts_with(b"\x89PNG") && first == second);
     assert_eq!(get(address, &format!("/values?x=0&y=0&token={token}"), &[]).0, 200);
     drop(slow);
     let end = Instant::now() + LIMIT;

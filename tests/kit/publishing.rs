@@ -10,5 +10,5 @@ pub mod zmtp;
 pub use zmtp::{GREETING, READY};
 
 pub fn frame(record: FrameRecord, film: impl Into<Arc<Film>>) -> Frame {
-    Frame { record: Arc::new(record), film: film.into(), tone_map: [1.0, 0.5, 1.0], color_bar: None }
+    Frame { record: Arc::new(record), film: film.into(), tone_map: [1.0, 0.5, 1.0], color_bar: None, gate: None }
 }

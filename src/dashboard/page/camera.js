@@ -1,11 +1,11 @@
 // Cameras as in a scene file: turned, moved and zoomed.
 
-const add = (a, b, by = 1) => a.map((value, k) => value + by * b[k]);
-const subtract = (a, b) => add(a, b, -1);
-const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
+export const add = (a, b, by = 1) => a.map((value, k) => value + by * b[k]);
+export const subtract = (a, b) => add(a, b, -1);
+export const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
 const scale = (a, by) => a.map((value) => value * by);
-const unit = (a) => scale(a, 1 / Math.hypot(...a));
-const cross = (a, b) => [0, 1, 2].map((k) => a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
+export const unit = (a) => scale(a, 1 / Math.hypot(...a));
+export const cross = (a, b) => [0, 1, 2].map((k) => a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
 const radians = (degrees) => (degrees * Math.PI) / 180;
 
 // Angle to `up` that is kept, since a camera must not look along it.
@@ -20,14 +20,14 @@ function turned(vector, axis, angle) {
 }
 
 /** Unit vectors to the right and up in the picture. */
-function film({ eye, look_at: at, up }) {
+export function film({ eye, look_at: at, up }) {
   const forward = unit(subtract(at, eye));
   const right = unit(cross(forward, up));
   return { right, upward: cross(right, forward) };
 }
 
 /** Half of the film's width and height, in scene units at the point that is looked at. */
-function halves({ eye, look_at: at, field_of_view: angle, orthographic }, aspect) {
+export function halves({ eye, look_at: at, field_of_view: angle, orthographic }, aspect) {
   const [distance, half] = [Math.hypot(...subtract(at, eye)), radians(angle) / 2];
   const width = distance * Math.tan(half);
   return [width, orthographic ? width / aspect : distance * Math.tan(half / aspect)];

@@ -11,6 +11,7 @@ const COLOURS = Array.from({ length: 64 }, (_, k) => viridis(k / 63));
 const LAYERS = {
   error: { title: "Stated error of the linear colours", range: (plane) => [0, spread(plane, 0, 0.995)?.[1]], zero: true },
   traced: { title: "Share of the queries that were traced", range: () => [0, 1], zero: true },
+  trusted: { title: "Share of the way in which the surrogate is trusted", range: () => [0, 1], zero: true },
   missing: { title: "Share of the rays that met missing data", range: () => [0, 1], zero: false },
   ftle: { title: "Mean FTLE of what is seen", range: (plane) => spread(plane, 0.005, 0.995), zero: true },
 };
@@ -103,7 +104,8 @@ export class Overlay {
   }
 
   draw(plane) {
-    const { title, range, zero } = LAYERS[plane.plane];
+    const { title: usual, range, zero } = LAYERS[plane.plane];
+    const title = plane.plane === "error" && plane.method === "map" ? "Stated error of the FTLE" : usual;
     const [low, high] = limits(range(plane));
     const { step, columns, rows, size, unit } = plane;
     const image = paintPlane(plane, [low, high], zero);

@@ -1,4 +1,5 @@
 // The page: brings messages, picture, charts and words together.
+import { Axes } from "./axes.js";
 import { Charts, rowOf } from "./charts.js";
 import { ColourBar } from "./colour_bar.js";
 import { Connection } from "./connection.js";
@@ -9,7 +10,7 @@ import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, address as fileAddress, asker, download, fieldCommand, histogramAsker, pixelAt, planeAsker } from "./values.js";
+import { Values, address as fileAddress, asker, download, fieldCommand, histogramAsker, pictureAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -42,11 +43,14 @@ const values = new Values({
 });
 
 const overlay = new Overlay({ ask: planeAsker(token), canvas: element("overlay"), root: element("overlaying") });
+const axes = new Axes({ root: element("axes"), canvas: element("frame"), toggle: element("axes-on") });
 const histogram = new Histogram({
   root: element("histogram"),
   ask: histogramAsker(token),
   change: (range) => steering.command({ transfer: range }),
 });
+
+const askPicture = pictureAsker(token);
 
 let connection;
 let newest = null;
@@ -167,6 +171,8 @@ function pictureChanged(shown) {
   element("frame").setAttribute("aria-label", `FTLE field of frame ${count(shown.frame)}`);
   colourBar.show(shown.header);
   if (record) showFacts(facts(record, shown.header));
+  axes.show(record);
+  element("scale-light").hidden = record?.method === "map";
   showPosition();
   charts.mark(picture.held ? shown.frame : null);
   values.frame = heldFrame();
@@ -269,6 +275,7 @@ function showSteering() {
   for (const [id, value] of Object.entries({ method, direction })) if (document.activeElement !== element(id)) element(id).value = value ?? "";
   element("tau").max = longest ?? "";
   element("budget").disabled = method !== "two_level";
+  element("method").options[0].disabled = steering.ready?.dimensions !== 2;
   const values = { budget, tau, tolerance: newest?.tolerance, ...(histogram.range ?? { low: null, high: null }) };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
@@ -282,9 +289,14 @@ async function save(ending) {
   if (told !== null) warnings.hold("download", told, picture.shown.frame);
 }
 
-/** Shows and copies the command for the field of the slide that is looked at, or hides it again. */
+/** Saves the pixels of a map; of other frames shows and copies the command for the field of the slide, or hides it again. */
 async function showField() {
   const [told, { record }] = [element("field-told"), picture.shown.header];
+  if (record?.method === "map" && told.hidden) {
+    const problem = await download("nc", { token, kept: values.kept, shown: picture.shown, held: picture.held });
+    if (problem === null) return;
+    warnings.hold("download", problem, picture.shown.frame);
+  }
   told.hidden = !told.hidden || !record;
   element("field").setAttribute("aria-expanded", String(!told.hidden));
   if (told.hidden) return;
@@ -308,6 +320,7 @@ async function share() {
 }
 
 function refresh() {
+  if (values.kept?.ready !== undefined && connection.status === "open") picture.refine(askPicture);
   showState();
   showSteering();
   showLog();
@@ -336,6 +349,7 @@ const KEYS = {
   Home: () => picture.lookBack(0),
   End: () => picture.follow(),
   o: () => overlay.cycle(element("overlay-of")),
+  g: () => axes.toggle(),
   f: toggleFullScreen,
   t: switchTheme,
   "?": () => element("help").showModal(),

@@ -2,6 +2,8 @@
 import { Pictures } from "./history.js";
 import { mediaType } from "./protocol.js";
 
+// A picture that has stood for so many milliseconds is worth its details.
+const IDLE = 1000;
 // From here on a picture looks better with visible pixels than smeared.
 const ENLARGED = 2;
 
@@ -31,13 +33,29 @@ export class Picture {
     if (type === undefined) throw new Error(`its encoding is ${header.encoding}; this page shows jpeg and png`);
     const blob = new Blob([payload], { type });
     const bitmap = await createImageBitmap(blob);
-    const picture = { frame: header.frame, elapsed: header.record?.seconds?.elapsed ?? null, header, blob };
+    const picture = { frame: header.frame, elapsed: header.record?.seconds?.elapsed ?? null, header, blob, since: performance.now(), asked: type !== "image/jpeg" };
     const restarted = this.kept.add(picture);
     if (restarted) this.held = false;
     if (this.held) this.changed(this.shown);
     else this.draw(picture, bitmap);
     bitmap.close();
     return restarted;
+  }
+
+  /** Draws the newest picture without the losses of JPEG, once it has stood for a while. `ask(frame)` resolves to its PNG. */
+  async refine(ask) {
+    const picture = this.shown;
+    if (picture === null || this.held || picture.asked || document.hidden || performance.now() - picture.since < IDLE) return;
+    picture.asked = true;
+    try {
+      const blob = await ask(picture.frame);
+      const bitmap = await createImageBitmap(blob);
+      Object.assign(picture, { blob, header: { ...picture.header, encoding: "png" } });
+      if (this.shown === picture) this.draw(picture, bitmap);
+      bitmap.close();
+    } catch {
+      // A newer one is there, or the server is lost: this one stays as it came.
+    }
   }
 
   draw(picture, bitmap) {

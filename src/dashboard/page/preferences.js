@@ -1,4 +1,4 @@
-// What is remembered: the token for this tab, and the theme.
+// What is remembered: the token for this tab, the theme, and whether axes are drawn.
 
 const TOKEN_KEY = `ridgewatch-token:${location.pathname}`;
 const THEME_KEY = "ridgewatch-theme";
@@ -11,6 +11,10 @@ function read(storage, key) {
 function write(storage, key, value) {
   try { window[storage].setItem(key, value); } catch { /* remembered until the page is closed */ }
 }
+
+/** What was chosen for a part of the page; null if nothing was. */
+export const recall = (name) => read("localStorage", `ridgewatch-${name}`);
+export const remember = (name, value) => write("localStorage", `ridgewatch-${name}`, value);
 
 /** The token of the page's address, or of an earlier visit in this tab; null without one. It is removed from the address, which may be shown to others. */
 export function takeToken() {

@@ -17,10 +17,14 @@ export function pixelAt({ clientX, clientY }, box, [width, height]) {
 const level = (value) => (Number.isFinite(value) && Math.abs(value) < 10 ? value.toFixed(3) : number(value));
 
 /** One line about a pixel. */
-export function valueWords({ frame, x, y, channels, unit, no_error: noError }) {
+export function valueWords({ frame, x, y, channels, unit, method, no_error: noError }) {
   const { R, G, B, A, error, "ftle.mean": ftle, "missing.share": missing } = channels;
   const where = `frame ${count(frame)} at ${x}, ${y}:`;
   if (missing === 1) return `${where} no data (land, or outside of the grid)`;
+  if (method === "map") {
+    const stated = Number.isFinite(error) ? `± ${number(error, 2)}` : "± unknown";
+    return Number.isFinite(ftle) ? `${where} FTLE ${number(ftle)} ${stated}${unit ? ` ${unit}` : ""}` : `${where} no value`;
+  }
   // Alpha is the share of rays that met a structure; without one there is no FTLE.
   const value = Number.isFinite(ftle) ? `FTLE ${withUnit(ftle, unit)}` : "no FTLE shown";
   const colour = `colour ${[R, G, B].map(level).join(" ")}`;
@@ -103,6 +107,9 @@ async function get(url, limit) {
 /** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */
 export const planeAsker = (token) => async (query) => (await get(address("plane", token, query), PLANE_LIMIT)).arrayBuffer();
 
+/** A function that asks for the picture of a frame without loss. */
+export const pictureAsker = (token) => async (frame) => (await get(address("frame.png", token, { frame }), PLANE_LIMIT)).blob();
+
 /** A function that asks for the counts of the FTLE. */
 export const histogramAsker = (token) => async () => (await get(address("histogram", token, {}), LIMIT)).json();
 
@@ -139,7 +146,7 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
-/** Saves a frame as `exr`, `png` or `json`: as the server has it, or else what this page has (not of `exr`). Returns what is to be told; null if nothing. */
+/** Saves a frame as `exr`, `nc`, `png` or `json`: as the server has it, or else what this page has (not of `exr` and `nc`). Returns what is to be told; null if nothing. */
 export async function download(ending, { token, kept, shown, held }) {
   const { header, blob } = shown;
   const run = kept?.ready ?? "run";
@@ -155,6 +162,7 @@ export async function download(ending, { token, kept, shown, held }) {
     }
   }
   if (ending === "exr") return `No EXR: ${problem}`;
+  if (ending === "nc") return `No NetCDF of this frame: ${problem}`;
   if (ending === "json") {
     save(new Blob([JSON.stringify(header.record, null, 2)], { type: "application/json" }), fileName(run, header.record, ending));
     return null;

@@ -56,7 +56,13 @@ function lagWords(record) {
 // Share traced from which the surrogate saves next to nothing.
 const NOTHING_SAVED = 0.9;
 
+/** Seeds of a map since it began anew; null if unknown. */
+function seedWords({ picture_error: error }) {
+  return known(error?.samples_per_pixel) ? `${count(error.samples_per_pixel)} seeds a pixel` : null;
+}
+
 function tracedWords(record) {
+  if (record.method === "map") return seedWords(record);
   const share = record.traced_share;
   if (!known(share)) return "share traced unknown";
   const saved = record.method === "gated" && share >= NOTHING_SAVED;
@@ -105,7 +111,7 @@ export function facts(record, header) {
     source: record.source || DASH,
     method: [record.method, record.surrogate].filter(Boolean).join(", ") || DASH,
     device: record.device || DASH,
-    size: `${record.size?.join(" × ") ?? DASH} pixels, ${number(record.samples_per_pixel)} samples a pixel`,
+    size: `${record.size?.join(" × ") ?? DASH} pixels, ${(record.method === "map" && seedWords(record)) || `${number(record.samples_per_pixel)} samples a pixel`}`,
     psnr: interval,
     traced: `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
     trusted: `${percent(record.trusted_volume)} of the domain`,

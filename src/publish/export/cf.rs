@@ -1,6 +1,6 @@
 //! A field as NetCDF by the CF conventions, of which 1.8 is the newest version that the CF checker knows.
 
-use super::{Field, FieldFrame, STATUS};
+use super::{Field, FieldFrame, Of, STATUS};
 use crate::source::MappingValue;
 use netcdf::{FileMut, Options, VariableMut};
 use std::io;
@@ -136,14 +136,18 @@ impl CfFile {
         let placed: Vec<(&str, &str)> = placed.iter().map(|(name, value)| (*name, value.as_str())).collect();
 
         let mut ftle = file.add_variable::<f64>("ftle", &dimensions)?;
-        let ancillary = if frame.pointwise.is_some() { "ftle_error " } else { "" };
+        let ancillary = match (frame.of, frame.pointwise) {
+            (Of::Pixels, _) => "ftle_error missing_share",
+            (Of::Seeds, Some(_)) => "ftle_error ftle_error_of_steps lifetime status",
+            (Of::Seeds, None) => "ftle_error_of_steps lifetime status",
+        };
         let meaning = if backward { "its ridges attract: particles come together there" } else { "its ridges repel: particles part there" };
         put(
             &mut ftle,
             &[
                 ("long_name", &format!("{direction} finite-time Lyapunov exponent")),
                 ("units", frame.ftle_units()),
-                ("ancillary_variables", &format!("{ancillary}ftle_error_of_steps lifetime status")),
+                ("ancillary_variables", ancillary),
                 ("direction", direction),
                 ("comment", meaning),
             ],
@@ -152,6 +156,18 @@ impl CfFile {
         put(&mut ftle, &[("integration_time_units", if frame.time_unit.is_empty() { "1" } else { &frame.time_unit })])?;
         ftle.put_attribute("_FillValue", FILL)?;
         put(&mut ftle, &placed)?;
+        if frame.of == Of::Pixels {
+            put(&mut ftle, &[("cell_methods", &format!("{}: {}: mean", axes[1], axes[0]))])?;
+            let mut error = file.add_variable::<f64>("ftle_error", &dimensions)?;
+            let named = "stated root mean square error of the mean over the pixel";
+            put(&mut error, &[("long_name", named), ("units", frame.ftle_units())])?;
+            error.put_attribute("_FillValue", FILL)?;
+            put(&mut error, &placed)?;
+            let mut missing = file.add_variable::<f64>("missing_share", &dimensions)?;
+            put(&mut missing, &[("long_name", "share of the pixel without a velocity"), ("units", "1")])?;
+            put(&mut missing, &placed)?;
+            return Ok(());
+        }
 
         if let Some(truth) = frame.pointwise {
             let mut error = file.add_variable::<f64>("ftle_error", &dimensions)?;
@@ -230,6 +246,19 @@ impl CfFile {
         // A full disk is told here, and not at the end.
         self.file.sync()?;
         self.written += 1;
+        Ok(())
+    }
+
+    /// Adds the pixels of a map: mean FTLE, its error and the share without a velocity, x fastest, upwards.
+    pub(super) fn add_pixels(&mut self, time: f64, [ftle, error, missing]: [&[f64]; 3]) -> Result<(), CfError> {
+        let window = self.frame.window(time);
+        let [x, y, _] = self.frame.grid;
+        self.variable("time")?.put_value(time, [0])?;
+        self.variable("time_bounds")?.put_values(&window, (&[0, 0][..], &[1, 2][..]))?;
+        for (name, values) in [("ftle", ftle), ("ftle_error", error), ("missing_share", missing)] {
+            let values: Vec<f64> = values.iter().map(|&value| if value.is_finite() { value } else { FILL }).collect();
+            self.variable(name)?.put_values(&values, (&[0, 0, 0][..], &[1, y, x][..]))?;
+        }
         Ok(())
     }
 

@@ -3,6 +3,7 @@
 //! One slide is held in memory at a time. A file has its name only when it is whole.
 
 mod cf;
+mod pixels;
 mod vtk;
 
 use super::error::PublishError;
@@ -11,6 +12,7 @@ use crate::flow::{Direction, VelocitySource};
 use crate::run::{Plan, Slide};
 use crate::source::Georeference;
 use cf::CfFile;
+pub use pixels::{MapAbout, NoMapField, map_netcdf};
 use std::path::{Path, PathBuf};
 use vtk::{VtkFiles, VtkKind};
 
@@ -57,6 +59,16 @@ pub struct FieldFrame {
     history: String,
     /// True if every field has the error of each seed.
     pointwise: Option<&'static str>,
+    of: Of,
+}
+
+/// What the values of a field are of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Of {
+    /// Seeds, with their lifetime and status.
+    Seeds,
+    /// Pixels of a map: means, with the share that has no velocity.
+    Pixels,
 }
 
 /// The FTLE of one slide; arrays have one value a seed, x fastest.
@@ -102,6 +114,7 @@ impl FieldFrame {
             tau: plan.map.tau,
             history,
             pointwise,
+            of: Of::Seeds,
         }
     }
 
@@ -118,8 +131,18 @@ impl FieldFrame {
 
     /// Name of an axis that is a word in every format: that of the source, unless another variable has it.
     fn axis_name(&self, axis: usize) -> String {
-        const TAKEN: [&str; 9] =
-            ["time", "time_bounds", "ftle", "ftle_error", "ftle_error_of_steps", "lifetime", "status", "integration_steps", "window"];
+        const TAKEN: [&str; 10] = [
+            "time",
+            "time_bounds",
+            "ftle",
+            "ftle_error",
+            "ftle_error_of_steps",
+            "lifetime",
+            "status",
+            "integration_steps",
+            "window",
+            "missing_share",
+        ];
         let own = ["x", "y", "z"][axis];
         let Some(coordinate) = self.georeference.axes.get(axis) else { return own.into() };
         // A dataset in a group is called by its path.

@@ -6,6 +6,7 @@ use crate::error::SourceError;
 use crate::formats::{Attribute, Listing, NewVariable, NumberType, Values, write_hdf5, write_netcdf};
 use crate::grids::{AxisPlan, Quantity, VelocityScale, to_heights};
 use ridgewatch_base::folder::Folder;
+use ridgewatch_base::progress::Work;
 use ridgewatch_base::setting::word;
 use ridgewatch_field::turbulence::Turbulence;
 use ridgewatch_field::{Axis, AxisFault, EARTH_RADIUS};
@@ -151,7 +152,9 @@ fn flame(settings: &SyntheticSettings, folder: &Folder) -> Result<Vec<PathBuf>, 
     let turbulence = turbulence(settings, settings.nodes);
     let what = format!("{WRITTEN_HERE}{}", settings.described());
     let mut files = Vec::new();
+    let work = Work::begin("writing the archive");
     for index in 0..settings.snapshots {
+        work.reached(index, settings.snapshots);
         let snapshot = turbulence.snapshot(index as f64, &grid);
         let dataset = |name, dimensions, values| NewVariable { name, dimensions, attributes: Vec::new(), values };
         let mut datasets = Vec::new();
@@ -198,7 +201,9 @@ fn ecmwf(settings: &SyntheticSettings, folder: &Folder) -> Result<Vec<PathBuf>, 
     let attributes = [("Conventions", "CF-1.6"), (SOURCE, what.as_str())];
     let coordinates: [&[f64]; 3] = std::array::from_fn(|k| axes[k].axis.coordinates());
     let mut files = Vec::new();
+    let work = Work::begin("writing the archive");
     for index in 0..settings.snapshots {
+        work.reached(index, settings.snapshots);
         let time = index as f64;
         let mut components: Vec<Vec<f32>> = match settings.shape {
             SyntheticShape::Globe => {

@@ -56,9 +56,9 @@ export async function stop(child, signal = "SIGTERM") {
   await once(child, "exit");
 }
 
-/** A run that publishes; `more` are further options, and `changes` further keys. */
+/** A run that publishes; `more` are further options, and `changes` further keys; `null` leaves a key out. */
 export function startPublisher(endpoint, folder, { scene = "configs/double_gyre.toml", changes = {}, more = [] } = {}) {
-  const settings = Object.entries({ ...SMALL, ...changes }).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
+  const settings = Object.entries({ ...SMALL, ...changes }).filter(([, value]) => value !== null).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
   const child = start(["replay", scene, "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings, ...more]);
   child.text = "";
   child.stdout.on("data", (part) => { child.text = (child.text + part).slice(-4000); });

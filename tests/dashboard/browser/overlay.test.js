@@ -107,6 +107,7 @@ test("the key goes through the layers, each said with its frame and scale, and f
   for (const [of, words] of [
     ["error", /^Stated error of the linear colours, frame [\d,]+$/],
     ["traced", /^Share of the queries that were traced, frame [\d,]+$/],
+    ["trusted", /^Share of the way in which the surrogate is trusted, frame [\d,]+$/],
     ["missing", /^Share of the rays that met missing data, frame [\d,]+: no data are missing$/],
     ["ftle", /^Mean FTLE of what is seen( \([^)]+\))?, frame [\d,]+$/],
   ]) {

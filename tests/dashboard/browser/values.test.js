@@ -25,6 +25,15 @@ test("a value is told with its error, and without one that is said", () => {
   assert.match(valueWords({ ...values, channels: { ...values.channels, error: null } }), /± –/);
 });
 
+test("a map has a value with its error, and colours say no more", () => {
+  const map = { ...values, method: "map" };
+  assert.equal(valueWords(map), "frame 1,200 at 5, 7: FTLE 0.213 ± 0.0041 1/s");
+  assert.equal(valueWords({ ...map, unit: "" }), "frame 1,200 at 5, 7: FTLE 0.213 ± 0.0041");
+  assert.match(valueWords({ ...map, channels: { ...values.channels, error: null } }), /: FTLE 0.213 ± unknown 1\/s$/);
+  assert.match(valueWords({ ...map, channels: { ...values.channels, "ftle.mean": null } }), /: no value$/);
+  assert.match(valueWords({ ...map, channels: { ...values.channels, "missing.share": 1 } }), /: no data/);
+});
+
 test("names of files tell run, frame and slide", () => {
   assert.equal(fileName("gulf", { frame: 12, slide: 3 }, "exr"), "gulf-frame-000012-slide-0003.exr");
 });

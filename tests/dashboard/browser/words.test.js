@@ -103,3 +103,10 @@ test("messages that differ in numbers are one, and the log is bounded", () => {
   assert.equal(warnings.log.entries.size, 100);
   assert.equal(warnings.log.newestFirst()[0].text, letters(499));
 });
+
+test("a map tells its seeds, and has no share traced", () => {
+  const map = { ...record, live: null, method: "map", traced_share: 1, picture_error: { ...record.picture_error, samples_per_pixel: 24 }, size: [320, 160] };
+  assert.match(sentence({ ...following, record: map }), /error 0\.89 % \(41 dB\), 24 seeds a pixel\.$/);
+  assert.equal(facts(map).size, "320 × 160 pixels, 24 seeds a pixel");
+  assert.match(sentence({ ...following, record: { ...map, picture_error: null } }), /error unknown\.$/);
+});

@@ -1,0 +1,142 @@
+// Where the picture lies: a graticule over a map, the edges of the box around a volume.
+import { add, cross, dot, film, halves, subtract, unit } from "./camera.js";
+import { ticks } from "./colour_bar.js";
+import { number } from "./words.js";
+
+// Points nearer to the eye than this share of the distance to what it looks at have no place in the picture.
+const NEAR = 1e-3;
+const ROUNDING = 1e-6;
+
+const between = (a, b, share) => add(a, subtract(b, a), share);
+
+/** What a record tells of its view; null if it lacks something, as those of older versions do. */
+function view({ camera, scale, domain, size }) {
+  const dimensions = domain?.axes?.length;
+  if (!camera || !Array.isArray(scale) || ![2, 3].includes(dimensions) || !(size?.[1] > 0)) return null;
+  const forward = unit(subtract(camera.look_at, camera.eye));
+  return {
+    camera, scale, domain, dimensions, forward,
+    distance: Math.hypot(...subtract(camera.look_at, camera.eye)),
+    film: film(camera), half: halves(camera, size[0] / size[1]),
+  };
+}
+
+/** Place of a domain point in the picture, in shares of its width and height from the left and the top, and its distance along the view. */
+function project({ camera, scale, film: { right, upward }, half: [width, height], forward, distance }, point) {
+  const offset = subtract(point.map((value, k) => value * scale[k]), camera.eye);
+  const depth = dot(offset, forward);
+  const shrink = camera.orthographic ? 1 : distance / depth;
+  return { x: 0.5 + (0.5 * shrink * dot(offset, right)) / width, y: 0.5 - (0.5 * shrink * dot(offset, upward)) / height, depth };
+}
+
+/** Ends in the picture of a line between domain points; null if nothing of it is seen. */
+function line(view, a, b) {
+  const nearest = view.camera.orthographic ? -Infinity : NEAR * view.distance;
+  const [depthA, depthB] = [a, b].map((point) => project(view, point).depth);
+  if (depthA < nearest && depthB < nearest) return null;
+  // A part behind the eye is cut off, with some room for rounding.
+  const cut = (from, to, depthFrom, depthTo) => (depthFrom < nearest ? between(from, to, (nearest * 1.001 - depthFrom) / (depthTo - depthFrom)) : from);
+  const [p, q] = [cut(a, b, depthA, depthB), cut(b, a, depthB, depthA)].map((point) => project(view, point));
+  // Liang and Barsky 1984.
+  let [first, last] = [0, 1];
+  for (const [start, move] of [[p.x, q.x - p.x], [p.y, q.y - p.y]]) {
+    for (const [room, way] of [[start, -move], [1 - start, move]]) {
+      // An edge of the domain may lie on the edge of the picture.
+      if (way === 0 && room < -ROUNDING) return null;
+      if (way < 0) first = Math.max(first, (room + ROUNDING) / way);
+      if (way > 0) last = Math.min(last, (room + ROUNDING) / way);
+    }
+  }
+  const at = (share) => [p.x + share * (q.x - p.x), p.y + share * (q.y - p.y)].map((value) => Math.min(Math.max(value, 0), 1));
+  return first < last ? [at(first), at(last)] : null;
+}
+
+/** A value of an axis; degrees as 10°E or 35°S. */
+export function placeWords(value, unit) {
+  if (unit === "degrees_east") {
+    const wrapped = ((((value + 180) % 360) + 360) % 360) - 180;
+    return `${number(Math.abs(wrapped), 6)}°${wrapped === 0 || wrapped === -180 ? "" : wrapped < 0 ? "W" : "E"}`;
+  }
+  if (unit === "degrees_north") return `${number(Math.abs(value), 6)}°${value === 0 ? "" : value < 0 ? "S" : "N"}`;
+  return number(value, 6);
+}
+
+const isDegrees = (unit) => /^degrees_(east|north)$/.test(unit);
+const axisWords = ([name, unit]) => (unit && !isDegrees(unit) ? `${name} (${unit})` : name);
+
+/** The part of the domain's middle plane that the picture shows: low and high ends of x and y. */
+function seen(view) {
+  const { camera, scale, domain: { min, max }, film: { right, upward }, half: [width, height], forward, distance } = view;
+  const level = (0.5 * (min[2] + max[2])) * scale[2];
+  const corners = [[-1, -1], [1, -1], [-1, 1], [1, 1]].map(([x, y]) => {
+    const offset = add(right.map((value) => value * x * width), upward, y * height);
+    const [from, along] = camera.orthographic ? [add(camera.eye, offset), forward] : [camera.eye, add(offset, forward, distance)];
+    const share = (level - from[2]) / along[2];
+    // Above the horizon nothing is met: all of the domain may be seen.
+    return Number.isFinite(share) && share > 0 ? add(from, along, share) : null;
+  });
+  return [0, 1].map((k) => {
+    if (corners.includes(null)) return [min[k], max[k]];
+    const ends = corners.map((corner) => corner[k] / scale[k]);
+    return [Math.max(min[k], Math.min(...ends)), Math.min(max[k], Math.max(...ends))];
+  });
+}
+
+function graticule(view) {
+  const { domain: { min, max, axes } } = view;
+  const middle = 0.5 * (min[2] + max[2]);
+  return seen(view).flatMap(([low, high], k) => {
+    if (!(high > low)) return [];
+    return ticks(low, high).flatMap((value, index) => {
+      const at = (other) => (k === 0 ? [value, other, middle] : [other, value, middle]);
+      const ends = line(view, at(min[1 - k]), at(max[1 - k]));
+      if (ends === null) return [];
+      // Lines of x are named at the bottom, those of y at the left.
+      const [a, b] = ends;
+      const place = k === 0 ? (a[1] > b[1] ? a : b) : a[0] < b[0] ? a : b;
+      const named = index === 0 && !isDegrees(axes[k][1]) ? `${axisWords(axes[k])} = ` : "";
+      return [{ ends, hidden: false, labels: [{ text: named + placeWords(value, axes[k][1]), place, side: k === 0 ? "below" : "left" }] }];
+    });
+  });
+}
+
+function box(view) {
+  const { camera, scale, forward, domain: { min, max, axes } } = view;
+  const corner = (bits) => [0, 1, 2].map((k) => (bits >> k & 1 ? max[k] : min[k]));
+  // A face is seen from its front.
+  const isSeen = (axis, end) => {
+    const normal = [0, 1, 2].map((k) => (k === axis ? (end ? 1 : -1) : 0));
+    const onIt = corner(end << axis).map((value, k) => value * scale[k]);
+    return (camera.orthographic ? -dot(normal, forward) : dot(normal, subtract(camera.eye, onIt))) > 0;
+  };
+  return [0, 1, 2].flatMap((axis) => {
+    const [u, v] = [0, 1, 2].filter((k) => k !== axis);
+    const edges = [0, 1, 2, 3].flatMap((place) => {
+      const start = ((place & 1) << u) | ((place >> 1) << v);
+      const faces = [isSeen(u, place & 1), isSeen(v, place >> 1)];
+      const ends = line(view, corner(start), corner(start | (1 << axis)));
+      return ends === null ? [] : [{ ends, hidden: !faces[0] && !faces[1], rim: faces[0] !== faces[1], labels: [] }];
+    });
+    // Named is an edge of the outline: the lowest, or the leftmost of the vertical ones.
+    const rank = ({ ends: [a, b] }) => (axis === 2 ? a[0] + b[0] : -a[1] - b[1]);
+    const outline = edges.filter(({ rim }) => rim);
+    const [best] = (outline.length > 0 ? outline : edges).sort((one, other) => rank(one) - rank(other));
+    if (best !== undefined) {
+      const [a, b] = best.ends;
+      const side = axis === 2 ? "left" : "below";
+      best.labels = [
+        { text: placeWords(min[axis], axes[axis][1]), place: between(a, b, 0.06), side },
+        { text: axisWords(axes[axis]), place: between(a, b, 0.5), side },
+        { text: placeWords(max[axis], axes[axis][1]), place: between(a, b, 0.94), side },
+      ];
+    }
+    return edges;
+  });
+}
+
+/** Lines over the picture of a record, with their labels; places are shares of its width and height from the left and the top. */
+export function axesOf(record) {
+  const seenFrom = record ? view(record) : null;
+  if (seenFrom === null) return [];
+  return seenFrom.dimensions === 2 ? graticule(seenFrom) : box(seenFrom);
+}

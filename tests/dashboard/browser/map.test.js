@@ -1,0 +1,128 @@
+// A map in Chromium: its axes, values, file and picture without loss; and the box of a volume.
+import assert from "node:assert/strict";
+import { mkdirSync, readFileSync } from "node:fs";
+import path from "node:path";
+import { after, before, test } from "node:test";
+import { launch, startShown, stop, temporary, until } from "./kit.js";
+
+const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
+const folder = temporary();
+const other = temporary();
+let browser;
+let map;
+let volume;
+let complaints;
+
+before(async () => {
+  mkdirSync(SCREENSHOTS, { recursive: true });
+  browser = await launch();
+  const changes = { "render.method": '"map"', "render.budget": null, "render.width": 320, "render.height": 160, "camera.orthographic": true };
+  map = await startShown(folder, { changes, more: [`--steer=ipc://${folder}/commands`] });
+  volume = await startShown(other, { scene: "configs/abc.toml", changes: { "time.frames_per_slide": 1000, "time.slides": 1 } });
+});
+
+after(async () => {
+  await browser?.close();
+  for (const child of [map?.child, volume?.child]) if (child) await stop(child);
+});
+
+async function open(address, options = {}) {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, ...options });
+  const page = await context.newPage();
+  complaints = [];
+  page.on("console", (message) => { if (["error", "warning"].includes(message.type()) && !/getImageData|status of 410/.test(message.text())) complaints.push(message.text()); });
+  page.on("pageerror", (error) => complaints.push(String(error)));
+  await page.goto(address);
+  await until("a picture", async () => /\d/.test(await page.textContent("#position")));
+  return page;
+}
+
+/** Texts of the axes, and where they are in shares of the picture. */
+const labels = (page) => page.evaluate(() => {
+  const canvas = document.getElementById("frame").getBoundingClientRect();
+  return [...document.querySelectorAll("#axes text")].map((text) => {
+    const box = text.getBoundingClientRect();
+    return { text: text.textContent, x: (box.left + box.width / 2 - canvas.left) / canvas.width, y: (box.top + box.height / 2 - canvas.top) / canvas.height };
+  });
+});
+
+test("lines lie at their values, follow the view, and are switched off", async () => {
+  const page = await open(map.url);
+  const one = async () => (await labels(page)).find(({ text }) => text === "1");
+  await until("the line of x = 1", one);
+  // The camera looks at x = 1.
+  assert.ok(Math.abs((await one()).x - 0.5) < 0.01 && (await one()).y > 0.9, JSON.stringify(await labels(page)));
+  await page.screenshot({ path: path.join(SCREENSHOTS, "map.png") });
+  await page.keyboard.press("g");
+  assert.deepEqual(await labels(page), []);
+  assert.equal(await page.isChecked("#axes-on"), false);
+  await page.reload();
+  await until("a picture", async () => /\d/.test(await page.textContent("#position")));
+  assert.deepEqual(await labels(page), [], "it is remembered");
+  await page.check("#axes-on");
+  await until("the line of x = 1", one);
+  await until("the controls", () => page.isVisible("#pause"));
+  await page.keyboard.press("d");
+  await until("another place", async () => Math.abs(((await one())?.x ?? 0.5) - 0.5) > 0.02);
+  await page.keyboard.press("0");
+  await until("the first place", async () => Math.abs(((await one())?.x ?? 0) - 0.5) < 0.01);
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
+test("a map says its values, seeds and error, and is saved as a field", async () => {
+  const page = await open(map.url);
+  await until("the sentence", async () => /, [\d,]+ seeds a pixel\.$/.test(await page.textContent("#state")));
+  assert.ok(await page.isHidden("#scale-light"), "colours of a map have no shadow");
+  const box = await page.locator("#frame").boundingBox();
+  await page.mouse.move(box.x + box.width / 3, box.y + box.height / 2);
+  await until("a value", async () => /^frame [\d,]+ at \d+, \d+: FTLE [\d.]+ ± [\d.e−]+$/.test(await page.textContent("#values")));
+  await page.selectOption("#overlay-of", "error");
+  await until("the overlay", async () => /^Stated error of the FTLE, frame/.test(await page.textContent("#overlay-text")));
+  await page.selectOption("#overlay-of", "trusted");
+  await until("its absence", async () => /^No overlay: map has no surrogate to trust$/.test(await page.textContent("#overlay-text")));
+  const [file] = await Promise.all([page.waitForEvent("download"), page.click("#field")]);
+  assert.match(file.suggestedFilename(), /^run-frame-\d{6}-slide-\d{4}\.nc$/);
+  assert.equal(readFileSync(await file.path()).subarray(0, 3).toString(), "CDF");
+  await until("the method", async () => (await page.inputValue("#method")) === "map");
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
+test("a picture that stands is drawn without the losses of JPEG", async () => {
+  const page = await open(map.url);
+  await until("the controls", () => page.isVisible("#pause"));
+  const form = () => page.textContent('[data-fact="picture"]');
+  await until("a picture of motion", async () => /, jpeg$/.test(await form()));
+  await page.click("#pause");
+  await until("a picture without loss", async () => /, png$/.test(await form()), 60_000);
+  // Viridis has no grey: of the colours of JPEG many are none of its own.
+  const address = new URL(map.url);
+  address.pathname = "/frame.png";
+  const differing = await page.$eval("#frame", async (canvas, url) => {
+    const bitmap = await createImageBitmap(await (await fetch(url)).blob());
+    const pixels = (source) => {
+      const context = Object.assign(document.createElement("canvas"), { width: canvas.width, height: canvas.height }).getContext("2d");
+      context.drawImage(source, 0, 0);
+      return context.getImageData(0, 0, canvas.width, canvas.height).data;
+    };
+    const [shown, exact] = [pixels(canvas), pixels(bitmap)];
+    return shown.filter((value, k) => value !== exact[k]).length;
+  }, address.href);
+  assert.equal(differing, 0);
+  await page.click("#pause");
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
+test("the box of a volume names its axes, in both themes", async () => {
+  for (const colorScheme of ["dark", "light"]) {
+    const page = await open(volume.url, { colorScheme });
+    await until("three axes", async () => (await labels(page)).filter(({ text }) => ["x", "y", "z"].includes(text)).length === 3);
+    assert.ok((await labels(page)).every(({ x, y }) => x > -0.02 && x < 1.02 && y > -0.02 && y < 1.02), JSON.stringify(await labels(page)));
+    assert.equal(await page.locator("#axes line.hidden-edge").count() > 0, true);
+    await page.screenshot({ path: path.join(SCREENSHOTS, `volume-${colorScheme}.png`) });
+    assert.deepEqual(complaints, []);
+    await page.context().close();
+  }
+});
