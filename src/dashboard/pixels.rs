@@ -196,7 +196,11 @@ impl Pixels {
         let busy = |_| (StatusCode::SERVICE_UNAVAILABLE, "another file is on its way: try again when it has arrived".to_owned());
         let permits = if matches!(file, File::Png) { &self.pictures } else { &self.downloads };
         let permit = Arc::clone(permits).try_acquire_owned().map_err(busy)?;
-        let (frame, run) = self.frame(uri)?;
+        let (frame, run) = match self.frame(uri) {
+            // A page that only wants a nicer picture is not told of an error, which browsers put on their console.
+            Err((StatusCode::GONE, _)) if parameter(uri, "if") == Some("newest") => return Ok(StatusCode::NO_CONTENT.into_response()),
+            found => found?,
+        };
         let pixels = frame.film.width * frame.film.height;
         if pixels > MAX_PIXELS {
             let found = format!("the picture has {pixels} pixels; accepted: {MAX_PIXELS}. The run folder holds its files");

@@ -23,7 +23,7 @@ use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::progress;
-use crate::render::{MAX_FRAMES_UNTIL, RenderError, RenderSettings, Renderer, Scene, Target};
+use crate::render::{MAX_FRAMES_UNTIL, Method, RenderError, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
@@ -687,7 +687,9 @@ impl<B: Backend> Cycle<'_, B> {
             if commands > Commands::None {
                 since_command = Some(0);
             }
-            if commands >= Commands::Method {
+            // The seeds of a map are those of any colours.
+            let keeps_picture = commands == Commands::Colours && self.run.render.method == Method::Map;
+            if commands >= Commands::Method && !keeps_picture {
                 with!(&mut self.session, on => on.picture = Default::default());
             }
             // Only smooth methods have a target.

@@ -106,6 +106,8 @@ fn what_cannot_be_told_is_said_in_words() {
     newest.put(frame(8, film([9, 4], false)));
     refused("/values?x=0&y=0&frame=7&", 410, "frame 7 is no longer kept: the run keeps its newest one, 8 by now");
     refused("/frame.exr?frame=7&", 410, "frame 7 is no longer kept");
+    assert_eq!(said("/frame.png?frame=7&if=newest&").0, 204);
+    assert_eq!(said("/frame.png?frame=8&if=newest&").0, 200);
     for (query, words) in [
         ("x=9&y=0&", "`x` is \"9\"; accepted: a pixel of the picture, 0 to 8"),
         ("x=0&y=4&", "`y` is \"4\"; accepted: a pixel of the picture, 0 to 3"),

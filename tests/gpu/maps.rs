@@ -2,6 +2,7 @@
 
 use super::scenes::*;
 use crate::kit::scene::double_gyre;
+use crate::small;
 use ridgewatch::backend::Device;
 use ridgewatch::backend::cuda::GpuSettings;
 use ridgewatch::run::{Frame, RunOptions};

@@ -6,6 +6,7 @@ import { number } from "./words.js";
 // Points nearer to the eye than this share of the distance to what it looks at have no place in the picture.
 const NEAR = 1e-3;
 const ROUNDING = 1e-6;
+const DIGITS = 6;
 
 const between = (a, b, share) => add(a, subtract(b, a), share);
 
@@ -52,13 +53,13 @@ function line(view, a, b) {
 }
 
 /** A value of an axis; degrees as 10°E or 35°S. */
-export function placeWords(value, unit) {
+export function placeWords(value, unit, digits = DIGITS) {
   if (unit === "degrees_east") {
     const wrapped = ((((value + 180) % 360) + 360) % 360) - 180;
-    return `${number(Math.abs(wrapped), 6)}°${wrapped === 0 || wrapped === -180 ? "" : wrapped < 0 ? "W" : "E"}`;
+    return `${number(Math.abs(wrapped), digits)}°${wrapped === 0 || wrapped === -180 ? "" : wrapped < 0 ? "W" : "E"}`;
   }
-  if (unit === "degrees_north") return `${number(Math.abs(value), 6)}°${value === 0 ? "" : value < 0 ? "S" : "N"}`;
-  return number(value, 6);
+  if (unit === "degrees_north") return `${number(Math.abs(value), digits)}°${value === 0 ? "" : value < 0 ? "S" : "N"}`;
+  return number(value, digits).replace(/\.?0+e/, "e");
 }
 
 const isDegrees = (unit) => /^degrees_(east|north)$/.test(unit);
@@ -87,15 +88,20 @@ function graticule(view) {
   const middle = 0.5 * (min[2] + max[2]);
   return seen(view).flatMap(([low, high], k) => {
     if (!(high > low)) return [];
-    return ticks(low, high).flatMap((value, index) => {
+    const values = ticks(low, high);
+    // As many as tell neighbours apart, however near the view is.
+    const digits = values.length < 2 ? DIGITS : Math.max(DIGITS, 1 + Math.ceil(Math.log10(Math.max(...values.map(Math.abs)) / (values[1] - values[0]))));
+    return values.flatMap((value, index) => {
       const at = (other) => (k === 0 ? [value, other, middle] : [other, value, middle]);
       const ends = line(view, at(min[1 - k]), at(max[1 - k]));
       if (ends === null) return [];
       // Lines of x are named at the bottom, those of y at the left.
       const [a, b] = ends;
       const place = k === 0 ? (a[1] > b[1] ? a : b) : a[0] < b[0] ? a : b;
-      const named = index === 0 && !isDegrees(axes[k][1]) ? `${axisWords(axes[k])} = ` : "";
-      return [{ ends, hidden: false, labels: [{ text: named + placeWords(value, axes[k][1]), place, side: k === 0 ? "below" : "left" }] }];
+      // The first of x and the last of y, which do not meet.
+      const isNamed = index === (k === 0 ? 0 : values.length - 1) && !isDegrees(axes[k][1]);
+      const text = `${isNamed ? `${axisWords(axes[k])} = ` : ""}${placeWords(value, axes[k][1], digits)}`;
+      return [{ ends, hidden: false, labels: [{ text, place, side: k === 0 ? "below" : "left" }] }];
     });
   });
 }
@@ -103,6 +109,9 @@ function graticule(view) {
 function box(view) {
   const { camera, scale, forward, domain: { min, max, axes } } = view;
   const corner = (bits) => [0, 1, 2].map((k) => (bits >> k & 1 ? max[k] : min[k]));
+  const centre = project(view, between(min, max, 0.5));
+  // Of a box around the eye that may lie behind it.
+  const middle = centre.depth > 0 ? [centre.x, centre.y] : [0.5, 0.5];
   // A face is seen from its front.
   const isSeen = (axis, end) => {
     const normal = [0, 1, 2].map((k) => (k === axis ? (end ? 1 : -1) : 0));
@@ -114,27 +123,30 @@ function box(view) {
     const edges = [0, 1, 2, 3].flatMap((place) => {
       const start = ((place & 1) << u) | ((place >> 1) << v);
       const faces = [isSeen(u, place & 1), isSeen(v, place >> 1)];
-      const ends = line(view, corner(start), corner(start | (1 << axis)));
-      return ends === null ? [] : [{ ends, hidden: !faces[0] && !faces[1], rim: faces[0] !== faces[1], labels: [] }];
+      const corners = [corner(start), corner(start | (1 << axis))];
+      const ends = line(view, ...corners);
+      return ends === null ? [] : [{ ends, corners, hidden: !faces[0] && !faces[1], rim: faces[0] !== faces[1], labels: [] }];
     });
     // Named is an edge of the outline: the lowest, or the leftmost of the vertical ones.
     const rank = ({ ends: [a, b] }) => (axis === 2 ? a[0] + b[0] : -a[1] - b[1]);
     const outline = edges.filter(({ rim }) => rim);
     const [best] = (outline.length > 0 ? outline : edges).sort((one, other) => rank(one) - rank(other));
     if (best !== undefined) {
-      const [a, b] = best.ends;
-      const side = axis === 2 ? "left" : "below";
-      best.labels = [
-        { text: placeWords(min[axis], axes[axis][1]), place: between(a, b, 0.06), side },
-        { text: axisWords(axes[axis]), place: between(a, b, 0.5), side },
-        { text: placeWords(max[axis], axes[axis][1]), place: between(a, b, 0.94), side },
-      ];
+      const label = (text, share) => ({ text, place: between(...best.ends, share), side: "outside", of: middle });
+      // The name first: where there is no room for all, it stays.
+      best.labels = [label(axisWords(axes[axis]), 0.5)];
+      for (const [k, share] of [0.06, 0.94].entries()) {
+        const { x, y, depth } = project(view, best.corners[k]);
+        // Where an edge is cut off it has another value than at its end.
+        const isEnd = (camera.orthographic || depth > 0) && Math.hypot(x - best.ends[k][0], y - best.ends[k][1]) < 10 * ROUNDING;
+        if (isEnd) best.labels.push(label(placeWords(best.corners[k][axis], axes[axis][1]), share));
+      }
     }
     return edges;
   });
 }
 
-/** Lines over the picture of a record, with their labels; places are shares of its width and height from the left and the top. */
+/** Lines over the picture of a record, with their labels; places are shares of its width and height from the left and the top. `side` tells where a label stands: `below` at the lower end of a line, `left` at its left end, `outside` beside it, away from `of`. */
 export function axesOf(record) {
   const seenFrom = record ? view(record) : null;
   if (seenFrom === null) return [];

@@ -275,6 +275,7 @@ function showSteering() {
   for (const [id, value] of Object.entries({ method, direction })) if (document.activeElement !== element(id)) element(id).value = value ?? "";
   element("tau").max = longest ?? "";
   element("budget").disabled = method !== "two_level";
+  element("tolerance").disabled = method === "map";
   element("method").options[0].disabled = steering.ready?.dimensions !== 2;
   const values = { budget, tau, tolerance: newest?.tolerance, ...(histogram.range ?? { low: null, high: null }) };
   for (const [id, value] of Object.entries(values)) {
@@ -359,7 +360,7 @@ const KEYS = {
 function pressKey(event) {
   const { key, target } = event;
   const types = target.matches("input[type=number], select");
-  const used = types || event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary"));
+  const used = types || event.ctrlKey || event.altKey || event.metaKey || element("help").open || (key === " " && target.closest("button, summary, input[type=checkbox]"));
   if (used || KEYS[key] === undefined) return;
   event.preventDefault();
   KEYS[key]();

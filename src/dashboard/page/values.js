@@ -107,8 +107,8 @@ async function get(url, limit) {
 /** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */
 export const planeAsker = (token) => async (query) => (await get(address("plane", token, query), PLANE_LIMIT)).arrayBuffer();
 
-/** A function that asks for the picture of a frame without loss. */
-export const pictureAsker = (token) => async (frame) => (await get(address("frame.png", token, { frame }), PLANE_LIMIT)).blob();
+/** A function that asks for the picture of a frame without loss, which is empty if the frame has moved on. */
+export const pictureAsker = (token) => async (frame) => (await get(address("frame.png", token, { frame, if: "newest" }), PLANE_LIMIT)).blob();
 
 /** A function that asks for the counts of the FTLE. */
 export const histogramAsker = (token) => async () => (await get(address("histogram", token, {}), LIMIT)).json();

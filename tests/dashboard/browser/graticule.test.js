@@ -19,7 +19,7 @@ test("a line of a map lies where its value does", () => {
   near(middle.map(([x]) => x), [0.5, 0.5]);
   near(middle.map(([, y]) => y).sort(), [0, 1]);
   near(find(lines, "0.6").ends.map(([, y]) => y), [0.4, 0.4]);
-  assert.deepEqual(labels(lines).filter(({ text }) => text.includes("=")).map(({ text }) => text), ["x = 0", "y = 0"]);
+  assert.deepEqual(labels(lines).filter(({ text }) => text.includes("=")).map(({ text }) => text), ["x = 0", "y = 1"]);
   for (const { place, side } of labels(lines)) assert.ok(side === "left" ? place[0] < 1e-5 : place[1] > 1 - 1e-5, `${place} ${side}`);
 });
 
@@ -28,6 +28,9 @@ test("a nearer view has finer lines, of what it shows only", () => {
   near(find(lines, "1").ends.map(([x]) => x), [0.5, 0.5]);
   near(find(lines, "1.05").ends.map(([x]) => x), [0.75, 0.75]);
   assert.equal(find(lines, "1.2"), undefined);
+  // So near that six digits would name neighbours alike.
+  const texts = labels(axesOf(map({ field_of_view: 1e-5, eye: [1.234567, 0.5, 1.2], look_at: [1.234567, 0.5, 0.2] }))).map(({ text }) => text);
+  assert.ok(texts.length > 6 && new Set(texts).size === texts.length && texts.includes("1.23456705"), String(texts));
 });
 
 test("perspective sees the middle of a slab from nearer than its top", () => {
@@ -40,7 +43,7 @@ test("degrees are told by their hemisphere", () => {
   const words = (unit) => (value) => placeWords(value, unit);
   assert.deepEqual([10, 350, -20.5, 0, 180, 190].map(words("degrees_east")), ["10°E", "10°W", "20.5°W", "0°", "180°", "170°W"]);
   assert.deepEqual([35, -35, 0].map(words("degrees_north")), ["35°N", "35°S", "0°"]);
-  assert.equal(words("m")(1500), "1500");
+  assert.deepEqual([1500, 2.5e6, -1e6, 2_512_500].map(words("m")), ["1500", "2.5e6", "−1e6", "2.5125e6"]);
 });
 
 const cube = {
@@ -59,6 +62,15 @@ test("a volume has twelve edges, three of them behind it, and an edge of each ax
   // Parallel projection along an axis: faces are seen edge on, and nothing breaks.
   const along = { ...cube, camera: { ...cube.camera, eye: [0.5, -5, 0.5], orthographic: true } };
   assert.equal(axesOf(along).length >= 8, true);
+});
+
+test("an edge that is cut off has its name, and no value where it does not end", () => {
+  const seen = (look_at, field_of_view) => labels(axesOf({ ...cube, camera: { ...cube.camera, look_at, field_of_view } })).map(({ text }) => text);
+  // The corner at x = 1, y = 0 and z = 2, where three edges meet.
+  assert.deepEqual(seen([1, 0, 1], 4), ["lon", "1°E", "lat", "0°", "height (m)", "2"]);
+  // The middle of an edge.
+  const across = seen([0.5, 0, 1], 2);
+  assert.ok(across.includes("lon") && across.every((text) => !/\d/.test(text)), String(across));
 });
 
 test("edges behind the eye are cut off", () => {

@@ -41,10 +41,21 @@ async function open(address, options = {}) {
 const labels = (page) => page.evaluate(() => {
   const canvas = document.getElementById("frame").getBoundingClientRect();
   return [...document.querySelectorAll("#axes text")].map((text) => {
-    const box = text.getBoundingClientRect();
-    return { text: text.textContent, x: (box.left + box.width / 2 - canvas.left) / canvas.width, y: (box.top + box.height / 2 - canvas.top) / canvas.height };
+    const { left, right, top, bottom } = text.getBoundingClientRect();
+    const [x, y] = [((left + right) / 2 - canvas.left) / canvas.width, ((top + bottom) / 2 - canvas.top) / canvas.height];
+    const inside = left >= canvas.left && right <= canvas.right && top >= canvas.top && bottom <= canvas.bottom;
+    return { text: text.textContent, x, y, inside, box: { left, right, top, bottom } };
   });
 });
+
+/** Labels are whole, and none lies on another. */
+async function assertLegible(page) {
+  const found = await labels(page);
+  assert.ok(found.length > 2 && found.every(({ inside }) => inside), JSON.stringify(found));
+  found.forEach(({ text, box: a }, k) => found.slice(k + 1).forEach(({ text: other, box: b }) => {
+    assert.ok(a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top, `${text} and ${other}`);
+  }));
+}
 
 test("lines lie at their values, follow the view, and are switched off", async () => {
   const page = await open(map.url);
@@ -52,6 +63,7 @@ test("lines lie at their values, follow the view, and are switched off", async (
   await until("the line of x = 1", one);
   // The camera looks at x = 1.
   assert.ok(Math.abs((await one()).x - 0.5) < 0.01 && (await one()).y > 0.9, JSON.stringify(await labels(page)));
+  await assertLegible(page);
   await page.screenshot({ path: path.join(SCREENSHOTS, "map.png") });
   await page.keyboard.press("g");
   assert.deepEqual(await labels(page), []);
@@ -59,13 +71,25 @@ test("lines lie at their values, follow the view, and are switched off", async (
   await page.reload();
   await until("a picture", async () => /\d/.test(await page.textContent("#position")));
   assert.deepEqual(await labels(page), [], "it is remembered");
-  await page.check("#axes-on");
+  await page.focus("#axes-on");
+  await page.keyboard.press("Space");
   await until("the line of x = 1", one);
+  assert.equal(await page.getAttribute("#live", "aria-pressed"), "true", "Space is of the box");
   await until("the controls", () => page.isVisible("#pause"));
   await page.keyboard.press("d");
   await until("another place", async () => Math.abs(((await one())?.x ?? 0.5) - 0.5) > 0.02);
+  await page.keyboard.press("Home");
+  await until("the place of an earlier picture", async () => Math.abs(((await one())?.x ?? 0) - 0.5) < 0.01);
+  await page.keyboard.press("End");
+  await until("the present place", async () => Math.abs(((await one())?.x ?? 0.5) - 0.5) > 0.02);
   await page.keyboard.press("0");
   await until("the first place", async () => Math.abs(((await one())?.x ?? 0) - 0.5) < 0.01);
+  await page.keyboard.press("f");
+  await until("full screen", () => page.evaluate(() => document.fullscreenElement !== null));
+  // All of the picture is there, and its labels with it.
+  await until("a picture as high as its stage", () => page.evaluate(() => document.getElementById("frame").clientHeight <= document.getElementById("stage").clientHeight));
+  await until("the line of x = 1", one);
+  await assertLegible(page);
   assert.deepEqual(complaints, []);
   await page.context().close();
 });
@@ -116,10 +140,10 @@ test("a picture that stands is drawn without the losses of JPEG", async () => {
 });
 
 test("the box of a volume names its axes, in both themes", async () => {
-  for (const colorScheme of ["dark", "light"]) {
-    const page = await open(volume.url, { colorScheme });
+  for (const [colorScheme, viewport] of [["dark", { width: 1280, height: 900 }], ["light", { width: 390, height: 844 }]]) {
+    const page = await open(volume.url, { colorScheme, viewport });
     await until("three axes", async () => (await labels(page)).filter(({ text }) => ["x", "y", "z"].includes(text)).length === 3);
-    assert.ok((await labels(page)).every(({ x, y }) => x > -0.02 && x < 1.02 && y > -0.02 && y < 1.02), JSON.stringify(await labels(page)));
+    await assertLegible(page);
     assert.equal(await page.locator("#axes line.hidden-edge").count() > 0, true);
     await page.screenshot({ path: path.join(SCREENSHOTS, `volume-${colorScheme}.png`) });
     assert.deepEqual(complaints, []);

@@ -136,7 +136,7 @@ test("of an earlier frame, of a method without an error and beside a run the pag
   await page.selectOption("#overlay-of", "error");
   await until("an error", async () => /^Stated error/.test(await text(page)));
   await page.selectOption("#method", "gated");
-  await until("it is said", async () => (await text(page)) === "No overlay: gated states no error of a pixel; marched and two_level do");
+  await until("it is said", async () => (await text(page)) === "No overlay: gated states no error of a pixel; map, marched and two_level do");
   assert.ok(!(await page.isVisible("#overlay")) && !(await page.isVisible("#overlay-scale")));
   await page.selectOption("#method", "two_level");
   await until("an error again", async () => /^Stated error/.test(await text(page)));
