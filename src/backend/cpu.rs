@@ -4,7 +4,7 @@
 
 use super::audit::{AuditFindings, AuditRequest, audit};
 use super::interruptible::Interruptible;
-use super::router::QueryRouter;
+use super::router::{QueryRouter, Tally};
 use super::{
     Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, StartsAnew, Surrogate, SurrogateRequest,
     TracedBricks,
@@ -12,9 +12,9 @@ use super::{
 use rayon::prelude::*;
 use ridgewatch_base::progress;
 use ridgewatch_field::{DomainPoint, UnitPoint};
-use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement, own_nodes};
-use ridgewatch_render::{Film, MapPicture, RenderStats, Renderer};
+use ridgewatch_render::{Film, LogStretch, MapPicture, RenderStats, Renderer};
 use ridgewatch_source::Listener;
 use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, Trace, build,
@@ -23,6 +23,7 @@ use ridgewatch_trust::Gate;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 /// The CPU.
 #[derive(Debug, Clone, Copy, Default)]
@@ -218,13 +219,50 @@ fn refine_on_cpu(
     })
 }
 
+/// Traces the seeds of a map. NaN, not traced, in missing cells.
+struct MapSeeds<'a> {
+    tracer: Interruptible<'a>,
+    traced: Traced,
+    tally: Tally,
+    failure: Option<DeviceError>,
+}
+
+impl LogStretch for MapSeeds<'_> {
+    fn evaluate(&mut self, points: &[DomainPoint], log_stretch: &mut [f32], traced: &mut [bool]) {
+        let began = Instant::now();
+        if self.failure.is_none() {
+            self.failure = self.tracer.trace(points, Extras::default(), &mut self.traced).err();
+        }
+        if self.failure.is_some() {
+            log_stretch.fill(f32::NAN);
+            traced.fill(false);
+            return;
+        }
+        let flow = self.tracer.flow();
+        let values = log_stretch.par_iter_mut().zip(traced).zip(points).zip(&self.traced.log_stretch).with_min_len(1 << 12);
+        let missing = values.map(|(((value, traced), &point), &found)| {
+            let is_missing = flow.is_missing(point);
+            (*value, *traced) = if is_missing { (f32::NAN, false) } else { (found, true) };
+            u64::from(is_missing)
+        });
+        let (missing, all) = (missing.sum::<u64>(), points.len() as u64);
+        let tally = &mut self.tally;
+        (tally.queries, tally.traced, tally.missing) = (tally.queries + all, tally.traced + all - missing, tally.missing + missing);
+        tally.trace_seconds += began.elapsed().as_secs_f64();
+    }
+}
+
 /// Adds to a map. Its points are chosen and its pixels summed on the CPU, whatever device traces.
 fn refine_map(frame: &HostFrame<'_>, renderer: &Renderer, picture: &mut HostPicture) -> Result<Rendered<Samples>, DeviceError> {
     let tracer = Interruptible::new(frame.tracer, frame.stop);
-    let mut router = QueryRouter::new(&tracer, None, frame.routing);
+    let mut seeds = MapSeeds { tracer, traced: Traced::default(), tally: Tally::default(), failure: None };
     let progress = frame.progress.map(|report| report as &dyn Fn(f32));
-    let refined = picture.map.refine(renderer, frame.samples, &mut router, progress, frame.stop);
-    let (tally, samples) = router.finish()?;
+    let refined = picture.map.refine(renderer, frame.samples, &mut seeds, progress, frame.stop);
+    if let Some(failure) = seeds.failure {
+        // It holds seeds without a value.
+        picture.map = MapPicture::default();
+        return Err(failure);
+    }
     let (film, stats, error) = match refined {
         Some((film, stats, error)) => (film, stats, Some(error).filter(PictureError::is_known)),
         None => {
@@ -232,7 +270,7 @@ fn refine_map(frame: &HostFrame<'_>, renderer: &Renderer, picture: &mut HostPict
             (film, stats, None)
         }
     };
-    Ok(Rendered { film, stats, tally, samples, error })
+    Ok(Rendered { film, stats, tally: seeds.tally, samples: Samples::default(), error })
 }
 
 /// What is left of a frame that was stopped.

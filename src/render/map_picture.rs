@@ -14,7 +14,9 @@ use std::time::Instant;
 /// Tone map of a map's linear colours: the inverse of [`linear`].
 pub const MAP_TONE: [f64; 3] = [1.0, 0.5, 2.2];
 /// Seeds that are traced at once, which bounds the memory beside the picture.
-const AT_ONCE: usize = 1 << 19;
+const AT_ONCE: usize = 1 << 21;
+/// Pixels of a task of one thread.
+const TASK: usize = 1 << 12;
 
 /// A colour of 8 bits as linear radiance, which [`MAP_TONE`] turns back.
 fn linear(colour: [u8; 3]) -> [f32; 3] {
@@ -72,6 +74,11 @@ impl Pixel {
         (self.known[0] > 0 && self.known[1] > 0).then(|| [0, 1].map(|half| self.sum[half] / f64::from(self.known[half])))
     }
 
+    /// The mean where most of the pixel has a velocity.
+    fn shown(&self) -> Option<f64> {
+        self.mean().filter(|_| self.missing_share() < 0.5)
+    }
+
     fn missing_share(&self) -> f32 {
         if self.within > 0 { self.missing as f32 / self.within as f32 } else { 0.0 }
     }
@@ -88,8 +95,7 @@ pub struct MapPicture {
 }
 
 impl MapPicture {
-    /// Adds `samples` seeds a pixel (rounded up to an even number) and draws the picture. `None` if `stop` ended it early; the picture is then as it
-    /// was before.
+    /// Adds `samples` seeds a pixel (rounded up to an even number) and draws the picture. `None` if `stop` ended it early; all seeds are then forgotten.
     pub fn refine(
         &mut self,
         renderer: &Renderer,
@@ -106,59 +112,82 @@ impl MapPicture {
         }
         let began = Instant::now();
         let numbers = self.seeds..self.seeds + (samples / 2.0).ceil().max(1.0) as usize;
-        let mut stats = RenderStats { paths: (2 * numbers.len() * self.pixels.len()) as u64, ..RenderStats::default() };
-        let mut next = self.pixels.clone();
+        let count = self.pixels.len();
+        let mut stats = RenderStats { paths: (2 * numbers.len() * count) as u64, ..RenderStats::default() };
         let at_once = (AT_ONCE / (2 * numbers.len())).max(1);
-        let count = next.len();
         let (mut points, mut log_stretch, mut traced) = (Vec::new(), Vec::new(), Vec::new());
-        for (part, pixels) in next.chunks_mut(at_once).enumerate() {
+        for (part, pixels) in self.pixels.chunks_mut(at_once).enumerate() {
             ridgewatch_base::progress::mark();
-            if stop.load(Ordering::Relaxed) {
-                return None;
-            }
             let first = part * at_once;
-            let seeds: Vec<Vec<(usize, DomainPoint)>> = (first..first + pixels.len())
+            // Points of a task's pixels, and how many of them each half of each pixel has.
+            let seeds: Vec<(Vec<DomainPoint>, Vec<[u32; 2]>)> = (0..pixels.len().div_ceil(TASK))
                 .into_par_iter()
-                .map(|pixel| {
-                    let corner = [pixel % size[0], pixel / size[0]].map(|n| n as f64);
-                    let half = |half| footprint(scene.seed, pixel, half, numbers.clone()).map(move |place| (half, place));
-                    let at =
-                        |[u, v]: [f64; 2]| [2.0 * (corner[0] + u) / size[0] as f64 - 1.0, 1.0 - 2.0 * (corner[1] + v) / size[1] as f64];
-                    half(0).chain(half(1)).filter_map(|(half, place)| Some((half, renderer.map_point(at(place))?))).collect()
+                .map(|task| {
+                    let own = first + task * TASK..first + pixels.len().min((task + 1) * TASK);
+                    let (mut points, mut within) = (Vec::with_capacity(2 * numbers.len() * own.len()), Vec::with_capacity(own.len()));
+                    for pixel in own {
+                        let corner = [pixel % size[0], pixel / size[0]].map(|n| n as f64);
+                        let at = |[u, v]: [f64; 2]| {
+                            renderer.map_point([2.0 * (corner[0] + u) / size[0] as f64 - 1.0, 1.0 - 2.0 * (corner[1] + v) / size[1] as f64])
+                        };
+                        within.push([0, 1].map(|half| {
+                            let before = points.len();
+                            points.extend(footprint(scene.seed, pixel, half, numbers.clone()).filter_map(at));
+                            (points.len() - before) as u32
+                        }));
+                    }
+                    (points, within)
                 })
                 .collect();
             points.clear();
-            points.extend(seeds.iter().flatten().map(|(_, point)| *point));
+            seeds.iter().for_each(|(own, _)| points.extend_from_slice(own));
             log_stretch.resize(points.len(), 0.0);
             traced.resize(points.len(), false);
             let asked = Instant::now();
             answers.evaluate(&points, &mut log_stretch, &mut traced);
             stats.evaluate_seconds += asked.elapsed().as_secs_f64();
             stats.waves += 1;
-            let mut values = log_stretch.iter().zip(&traced);
-            for (pixel, seeds) in pixels.iter_mut().zip(&seeds) {
-                pixel.within += seeds.len() as u32;
-                for ((half, _), (&value, &traced)) in seeds.iter().zip(&mut values) {
-                    stats.traced += u64::from(traced);
-                    if value.is_finite() {
-                        pixel.sum[*half] += f64::from(value);
-                        pixel.known[*half] += 1;
-                    } else if !traced {
-                        pixel.missing += 1;
-                        stats.missing += 1;
-                    }
-                }
+            // A stop may have left seeds untraced.
+            if stop.load(Ordering::Relaxed) {
+                *self = Self::default();
+                return None;
             }
+            let begins: Vec<usize> = (seeds.iter())
+                .scan(0, |end, (own, _)| {
+                    *end += own.len();
+                    Some(*end - own.len())
+                })
+                .collect();
+            let (found, missing) = (pixels.par_chunks_mut(TASK).zip(&seeds).zip(&begins))
+                .map(|((pixels, (_, within)), &begin)| {
+                    let (mut next, mut counts) = (begin, (0, 0));
+                    for (pixel, within) in pixels.iter_mut().zip(within) {
+                        for (half, &count) in within.iter().enumerate() {
+                            let own = next..next + count as usize;
+                            next = own.end;
+                            pixel.within += count;
+                            for (&value, &traced) in log_stretch[own.clone()].iter().zip(&traced[own]) {
+                                counts.0 += u64::from(traced);
+                                if value.is_finite() {
+                                    pixel.sum[half] += f64::from(value);
+                                    pixel.known[half] += 1;
+                                } else if !traced {
+                                    pixel.missing += 1;
+                                    counts.1 += 1;
+                                }
+                            }
+                        }
+                    }
+                    counts
+                })
+                .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+            (stats.traced, stats.missing) = (stats.traced + found, stats.missing + missing);
             stats.queries += points.len() as u64;
             if let Some(progress) = progress {
                 progress((first + pixels.len()) as f32 / count as f32);
             }
         }
-        // A stop may have left seeds untraced.
-        if stop.load(Ordering::Relaxed) {
-            return None;
-        }
-        (self.pixels, self.seeds) = (next, numbers.end);
+        self.seeds = numbers.end;
         let (film, error) = self.film(renderer);
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
@@ -172,54 +201,60 @@ impl MapPicture {
         let [low, high] = renderer.transfer().range();
         let share = |log_stretch: f64| (log_stretch * per_time - low) / (high - low);
         let (background, land) = (settings.background.map(|c| c as f32), settings.missing_color.map(|c| c as f32));
-        let mut film = Film::new(width, height);
-        for (i, pixel) in self.pixels.iter().enumerate() {
-            let mean = pixel.mean().filter(|_| pixel.missing_share() < 0.5);
-            let (colour, alpha) = match mean {
+        let mut film = Film::resident(width, height);
+        film.rgba.par_iter_mut().zip(&self.pixels).with_min_len(TASK).for_each(|(rgba, pixel)| {
+            let (colour, alpha) = match pixel.shown() {
                 Some(mean) => (map_radiance(share(mean)), 1.0),
                 None if pixel.within > 0 => (land, 0.0),
                 None => (background, 0.0),
             };
-            film.rgba[i] = [colour[0], colour[1], colour[2], alpha];
-            film.ftle_mean[i] = mean.map_or(f32::NAN, |mean| (mean * per_time) as f32);
-            film.missing[i] = pixel.missing_share();
-            (film.samples[i], film.queries[i]) = (2.0 * self.seeds as f32, pixel.within as f32);
-            film.traced[i] = if pixel.missing < pixel.within { 1.0 } else { 0.0 };
-        }
+            *rgba = [colour[0], colour[1], colour[2], alpha];
+        });
+        let layer = |layer: &mut Vec<f32>, value: &(dyn Fn(&Pixel) -> f32 + Sync)| {
+            layer.par_iter_mut().zip(&self.pixels).with_min_len(TASK).for_each(|(to, pixel)| *to = value(pixel));
+        };
+        layer(&mut film.ftle_mean, &|pixel| pixel.shown().map_or(f32::NAN, |mean| (mean * per_time) as f32));
+        layer(&mut film.missing, &Pixel::missing_share);
+        layer(&mut film.samples, &|_| 2.0 * self.seeds as f32);
+        layer(&mut film.queries, &|pixel| pixel.within as f32);
+        layer(&mut film.traced, &|pixel| if pixel.missing < pixel.within { 1.0 } else { 0.0 });
         let columns = width.div_ceil(TILE);
         let mut tiles = vec![TileSums::default(); columns * height.div_ceil(TILE)];
         let mut variances = vec![f32::NAN; self.pixels.len()];
-        for (i, pixel) in self.pixels.iter().enumerate() {
-            let tile = &mut tiles[i / width / TILE * columns + i % width / TILE];
-            tile.all.pixels += 1.0;
-            let Some(halves) = pixel.halves().filter(|_| film.rgba[i][3] > 0.0) else { continue };
-            // The mean (a + b) / 2 of independent, unbiased halves has the variance E[(a - b)^2] / 4. What the ends of the colours hide is no error
-            // of the picture.
-            let [a, b] = halves.map(share);
-            let variance = 0.25 * (a - b).powi(2);
-            let shown = 0.25 * (a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).powi(2);
-            let level = (0.5 * (a + b)).powi(2);
-            let squared = [variance, variance / (level + 0.01), shown];
-            let largest = [level, level / (level + 0.01), level.min(1.0)];
-            tile.lit.pixels += 1.0;
-            for of in [&mut tile.all, &mut tile.lit] {
-                of.pairs += self.seeds as f32;
-                for k in 0..3 {
-                    of.squared[k] += squared[k] as f32;
-                    // Sums of squares; their roots are taken below.
-                    of.scatter[k] += (squared[k] * squared[k]) as f32;
-                    of.radiance[k] += largest[k] as f32;
+        let rows = tiles.par_chunks_mut(columns).zip(self.pixels.par_chunks(width * TILE)).zip(variances.par_chunks_mut(width * TILE));
+        rows.for_each(|((tiles, pixels), variances)| {
+            for (i, (pixel, variance_of)) in pixels.iter().zip(variances).enumerate() {
+                let tile = &mut tiles[i % width / TILE];
+                tile.all.pixels += 1.0;
+                let Some(halves) = pixel.halves().filter(|_| pixel.shown().is_some()) else { continue };
+                // The mean (a + b) / 2 of independent, unbiased halves has the variance E[(a - b)^2] / 4. What the ends of the colours hide is no error
+                // of the picture.
+                let [a, b] = halves.map(share);
+                let variance = 0.25 * (a - b).powi(2);
+                let shown = 0.25 * (a.clamp(0.0, 1.0) - b.clamp(0.0, 1.0)).powi(2);
+                let level = (0.5 * (a + b)).powi(2);
+                let squared = [variance, variance / (level + 0.01), shown];
+                let largest = [level, level / (level + 0.01), level.min(1.0)];
+                tile.lit.pixels += 1.0;
+                for of in [&mut tile.all, &mut tile.lit] {
+                    of.pairs += self.seeds as f32;
+                    for k in 0..3 {
+                        of.squared[k] += squared[k] as f32;
+                        // Sums of squares; their roots are taken below.
+                        of.scatter[k] += (squared[k] * squared[k]) as f32;
+                        of.radiance[k] += largest[k] as f32;
+                    }
                 }
+                *variance_of = (variance * (high - low).powi(2)) as f32;
             }
-            variances[i] = (variance * (high - low).powi(2)) as f32;
-        }
-        for of in tiles.iter_mut().flat_map(|tile| [&mut tile.all, &mut tile.lit]) {
-            of.scatter = of.scatter.map(f32::sqrt);
-        }
+            for of in tiles.iter_mut().flat_map(|tile| [&mut tile.all, &mut tile.lit]) {
+                of.scatter = of.scatter.map(f32::sqrt);
+            }
+        });
         let error = PictureError { unbiased: true, ..PictureError::of(&tiles, &MarchError::default(), 2.0 * self.seeds as f64, 0) };
         let floor = if error.is_known() { (ERROR_FLOOR * error.rms.value.powi(2) * (high - low).powi(2)) as f32 } else { 0.0 };
         // Without a value there is no error of it.
-        film.error = (smoothed(&variances, width, ERROR_RADIUS).into_iter().zip(&film.ftle_mean))
+        film.error = (smoothed(&variances, width, ERROR_RADIUS).into_par_iter().zip(&film.ftle_mean))
             .map(|(variance, value)| if value.is_finite() { variance.max(floor).sqrt() } else { f32::NAN })
             .collect();
         (film, error)
