@@ -6,6 +6,7 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::files::write_whole;
 use ridgewatch::map::FramePage;
 use ridgewatch::publish::PastRun;
+use ridgewatch::render::{MAP_TONE, Method};
 use ridgewatch::run::ColorBar;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -60,7 +61,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         anyhow::anyhow!("{}: the record of frame {frame} {why}; `ridgewatch replay {}` repeats the run", run.display(), path.display())
     })?;
     check_folder(out)?;
-    let picture = past.picture(&record, scene.render.tone_map)?;
+    let tone_map = if record.method == Method::Map.name() { MAP_TONE } else { scene.render.tone_map };
+    let picture = past.picture(&record, tone_map)?;
     let page = FramePage::new(picture, &record, &colours, &scene.title, options.width as usize)?;
     let bytes = if extension == "svg" { page.svg()?.into_bytes() } else { page.png()? };
     write_whole(out, &bytes).with_context(|| format!("cannot write {}", out.display()))?;

@@ -23,7 +23,7 @@ pub struct Options {
     /// default, map (two dimensions), auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
-    /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
+    /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by map (which takes an even number), marched and two_level.
     #[arg(long, value_name = "N")]
     spp: Option<f64>,
     /// map, marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3, and its interval reaches at most 20 % beyond.

@@ -421,8 +421,9 @@ pub fn line(record: &FrameRecord) -> String {
     }
     if let Some(error) = &record.picture_error {
         let (psnr, rms) = (error.psnr, error.rms);
+        let of = if record.method == "map" { " of the colours' range" } else { "" };
         text += &format!(
-            ", picture {:.1} dB [{:.1}, {:.1}], error {:.4} [{:.4}, {:.4}] rms",
+            ", picture {:.1} dB [{:.1}, {:.1}], error {:.4} [{:.4}, {:.4}] rms{of}",
             psnr.value, psnr.low, psnr.high, rms.value, rms.low, rms.high
         );
     } else if let Some(error) = &record.trusted_error {

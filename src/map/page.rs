@@ -188,9 +188,12 @@ pub(super) fn picture_error(record: &FrameRecord) -> String {
         // The peak of the picture is 1.
         let share = |decibels: f64| number(100.0 * 10f64.powf(-decibels / 20.0));
         let [value, low, high] = [error.psnr.value, error.psnr.low, error.psnr.high];
-        let pixels = if record.method == Method::Map.name() { "pixels with a value" } else { "lit pixels" };
+        let (what, pixels) = match record.method == Method::Map.name() {
+            true => ("Error of the FTLE, of the range of the colours", "pixels with a value"),
+            false => ("Error of colours", "lit pixels"),
+        };
         return format!(
-            "Error of colours: {} % rms [{}, {}], {value:.1} dB [{low:.1}, {high:.1}], over {pixels}, 95 % intervals.",
+            "{what}: {} % rms [{}, {}], {value:.1} dB [{low:.1}, {high:.1}], over {pixels}, 95 % intervals.",
             share(value),
             share(high),
             share(low)

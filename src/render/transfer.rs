@@ -25,10 +25,16 @@ impl TransferSettings {
 
     /// The same for a map, which shows values below the median too ([`map_range`]).
     pub fn scaled_to_map(&self, ftle: &[f32]) -> Self {
-        let [low, high] = map_range(ftle.iter().copied(), false);
-        let open = Self { low: Some(self.low.unwrap_or(low)), high: Some(self.high.unwrap_or(high)), ..self.clone() };
-        // An end that is given may lie beyond the other.
-        if open.low < open.high { open } else { self.scaled_to(ftle) }
+        let [first, last] = map_range(ftle.iter().copied(), false);
+        // An end that is given may lie beyond all values.
+        let beside = |end: f64| end.abs().max(1e-9);
+        let high = self.high.unwrap_or_else(|| self.low.filter(|low| *low >= last).map_or(last, |low| low + beside(low)));
+        let low = self.low.unwrap_or(match first {
+            first if first >= 0.0 && first < 0.5 * high => 0.0,
+            first if first < high => first,
+            _ => high - beside(high),
+        });
+        Self { low: Some(low), high: Some(high), ..self.clone() }
     }
 }
 
@@ -147,6 +153,20 @@ mod tests {
 
     fn published() -> TransferSettings {
         TransferSettings { low: Some(0.05), high: Some(0.235), extinction: Some(100.0), ..TransferSettings::default() }
+    }
+
+    #[test]
+    fn open_ends_of_a_map_lie_beside_those_that_are_given() {
+        let ftle: Vec<f32> = (0..1000).map(|i| 1.0 + i as f32 * 1e-3).collect();
+        let ends = |low, high| {
+            let scaled = TransferSettings { low, high, ..TransferSettings::default() }.scaled_to_map(&ftle);
+            [scaled.low.unwrap(), scaled.high.unwrap()].map(|end| (end * 1e3).round() / 1e3)
+        };
+        // The first percentile is above half of the last.
+        assert_eq!(ends(None, None), [1.01, 1.994]);
+        assert_eq!((ends(None, Some(4.0)), ends(Some(1.5), None)), ([0.0, 4.0], [1.5, 1.994]));
+        assert_eq!((ends(None, Some(0.3)), ends(None, Some(-2.0)), ends(Some(3.0), None)), ([0.0, 0.3], [-4.0, -2.0], [3.0, 6.0]));
+        assert!(TransferSettings::default().scaled_to_map(&[0.7; 9]).low < Some(0.7));
     }
 
     #[test]

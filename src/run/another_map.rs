@@ -93,10 +93,10 @@ impl<B: Backend> Cycle<'_, B> {
         if !self.run.has_range {
             let plan = self.run.plan;
             scene.transfer = loop {
-                let stop = self.run.stop;
+                let (stop, method) = (self.run.stop, self.run.render.method);
                 let settled = with!(&self.session, on => {
                     let tracer = on.tracer();
-                    self.run.threads.render().install(|| colours(plan, tracer, slide, stop))
+                    self.run.threads.render().install(|| colours(plan, method, tracer, slide, stop))
                 });
                 match settled {
                     Err(RunEnd::Device(error)) => self.session.recover(error, slide, &self.map, &mut self.run)?,
@@ -123,7 +123,7 @@ impl<B: Backend> Cycle<'_, B> {
         run.transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(run.renderer.transfer().extinction_max()) };
         run.report.transfer = Some(run.transfer);
         if !run.has_range {
-            enter_colours(&plan.scene, run.transfer, &mut run.report.decisions);
+            enter_colours(&plan.scene, run.render.method, run.transfer, &mut run.report.decisions);
         }
         run.draw_color_bar();
         Ok(())

@@ -485,7 +485,7 @@ impl<'a> Run<'a> {
             Decision::new("surrogate.table_nodes", format_args!("{nodes:?}"), format_args!("{because}; {:.2} MB", bytes as f64 / 1e6))
                 .enter(&mut report.decisions);
         }
-        enter_colours(&plan.scene, transfer, &mut report.decisions);
+        enter_colours(&plan.scene, scene.render.method, transfer, &mut report.decisions);
         report.transfer = Some(transfer);
         report.integration_steps = fixed_steps(flow);
         let learning = Learning {
@@ -692,7 +692,7 @@ impl<B: Backend> Cycle<'_, B> {
             if commands >= Commands::Method && !keeps_picture {
                 with!(&mut self.session, on => on.picture = Default::default());
             }
-            // Only smooth methods have a target.
+            // Only pictures that accumulate have a target.
             let target = self.run.render.until;
             let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
             if commands == Commands::Map {

@@ -43,11 +43,13 @@ impl std::fmt::Display for Decision {
 }
 
 /// Enters the choices for the ends of the colour scale that the scene leaves open.
-pub(super) fn enter_colours(scene: &Settings, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
+pub(super) fn enter_colours(scene: &Settings, method: Method, chosen: TransferRecord, decisions: &mut Vec<Decision>) {
     let given = scene.transfer.clone().unwrap_or_default();
     if given.low.is_none() {
-        let why = match scene.render.method {
-            Method::Map => "0, or the first percentile of the FTLE over the domain if that is negative or above half of the upper end",
+        let why = match method {
+            Method::Map => {
+                "0, or the first percentile of the FTLE over the domain if that is negative or above half of the upper end, or below an FTLE that hardly varies"
+            }
             _ => "median of the FTLE over the domain",
         };
         Decision::new("transfer.low", chosen.low, why).enter(decisions);

@@ -13,7 +13,7 @@ use std::sync::atomic::AtomicBool;
 
 /// Scene of the picture, with the colours of [`settled_colours`].
 pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<Scene, RunEnd> {
-    Ok(Scene { transfer: colours(plan, tracer, slide, stop)?, ..assemble(&plan.scene, &plan.domain) })
+    Ok(Scene { transfer: colours(plan, plan.scene.render.method, tracer, slide, stop)?, ..assemble(&plan.scene, &plan.domain) })
 }
 
 /// Transfer function of a run. Values that the scene leaves open are scaled to the FTLE of the first slide and kept for the whole run, so that
@@ -22,7 +22,7 @@ pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop
 /// # Errors
 /// The device fails, or every probed point is missing.
 pub fn settled_colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide) -> Result<TransferSettings, RunError> {
-    match colours(plan, tracer, slide, &AtomicBool::new(false)) {
+    match colours(plan, plan.scene.render.method, tracer, slide, &AtomicBool::new(false)) {
         Ok(transfer) => Ok(transfer),
         Err(RunEnd::Failed(error)) => Err(error),
         Err(RunEnd::Device(error)) => Err(RunError::Device(Box::new(error))),
@@ -30,7 +30,14 @@ pub fn settled_colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide) -> Result
     }
 }
 
-pub(super) fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<TransferSettings, RunEnd> {
+/// Colours of a slide that is drawn by `method`, as [`settled_colours`].
+pub(super) fn colours(
+    plan: &Plan,
+    method: Method,
+    tracer: &dyn Trace,
+    slide: &Slide,
+    stop: &AtomicBool,
+) -> Result<TransferSettings, RunEnd> {
     let file = &plan.scene;
     let transfer = file.transfer.clone().unwrap_or_default();
     if transfer.low.is_none() || transfer.high.is_none() {
@@ -47,7 +54,7 @@ pub(super) fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &Ato
                 when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
             }));
         }
-        return Ok(if file.render.method == Method::Map { transfer.scaled_to_map(&ftle) } else { transfer.scaled_to(&ftle) });
+        return Ok(if method == Method::Map { transfer.scaled_to_map(&ftle) } else { transfer.scaled_to(&ftle) });
     }
     Ok(transfer)
 }

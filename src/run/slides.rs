@@ -192,7 +192,8 @@ impl Slides for ArchiveSlides {
         let start = Instant::now();
         let mut warnings = Vec::new();
         let Self { reader, window, taken, .. } = self;
-        let work = Work::begin("reading the window");
+        // What is not there yet is waited for, and has no time left.
+        let work = (!self.follows).then(|| Work::begin("reading the window"));
         while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
             let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
             let news = reader.news();
@@ -207,7 +208,7 @@ impl Slides for ArchiveSlides {
                 Err(fault) => warnings.push(fault.to_string()),
             }
             *taken += usize::from(window.newest() != newest);
-            if let (false, Some(oldest), Some(newest)) = (window.is_full(), window.oldest(), window.newest()) {
+            if let (false, Some(work), Some(oldest), Some(newest)) = (window.is_full(), &work, window.oldest(), window.newest()) {
                 work.reached((1e6 * (newest - oldest) / window.span()) as usize, 1_000_000);
             }
         }

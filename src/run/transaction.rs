@@ -16,7 +16,7 @@ pub(super) struct On<B: Backend> {
     pub(super) backend: B,
     /// Holds the window, on the host and on the device. `None` between two slides.
     pub(super) tracer: Option<B::Tracer>,
-    /// `None` for the method `reference`.
+    /// `None` for the methods `reference` and `map`.
     pub(super) surrogate: Option<B::Surrogate>,
     /// Picture of the slide, which accumulates over smooth frames.
     pub(super) picture: B::Picture,

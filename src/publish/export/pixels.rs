@@ -60,7 +60,8 @@ impl Centres {
         };
         let (corner, right, down) = (at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0));
         let step = [right[0] - corner[0], corner[1] - down[1]];
-        let slack = 1e-9 * (step[0].abs() + step[1].abs());
+        // A millionth of a pixel, more than rounding in a near view.
+        let slack = 1e-6 * (step[0].abs() + step[1].abs());
         let is_straight = (right[1] - corner[1]).abs() <= slack && (down[0] - corner[0]).abs() <= slack;
         // Far pixels of a view that is tilted lie elsewhere.
         let far = at(width as f64, height as f64);
