@@ -331,6 +331,7 @@ mod tests {
     }
 
     #[test]
+    #[allow(clippy::print_stdout)] // figures of docs/maps.md
     fn the_stated_error_holds_as_seeds_accumulate() {
         let size = [48, 24];
         let truth = MapPicture::default().refine(&renderer(999, size, None), 16384.0, &mut Field(ridges), None, &NEVER).unwrap().0;
