@@ -41,7 +41,7 @@ impl NewestFrame {
         &self.run
     }
 
-    /// The pixels of a frame, of a map, as NetCDF ([`map_netcdf`]).
+    /// The pixels of a frame, of a map, as NetCDF by the CF conventions.
     ///
     /// # Errors
     /// Why it is no such field, or what the system refuses.

@@ -11,7 +11,7 @@ use ridgewatch_field::DomainPoint;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Tone map of a map's linear colours: the inverse of [`linear`].
+/// Tone map of a map's linear colours, which gives their 8 bits back.
 pub const MAP_TONE: [f64; 3] = [1.0, 0.5, 2.2];
 /// Seeds that are traced at once, which bounds the memory beside the picture.
 const AT_ONCE: usize = 1 << 21;
