@@ -165,10 +165,11 @@ fn a_map_is_a_field_on_axes() {
         std::fs::write(file.path(), found).unwrap();
         let opened = netcdf::open(file.path()).unwrap();
         let values = |name: &str| opened.variable(name).unwrap().get_values::<f64, _>(..).unwrap();
-        (["x", "y", "time", "ftle", "ftle_error", "missing_share"].map(values), values("time_bounds"))
+        (["x", "y", "time", "ftle", "ftle_error", "missing_share"].map(values), values("time_bounds"), values("y_bounds"))
     };
     let film = film([8, 4], true);
-    let ([x, y, time, ftle, error, missing], bounds) = read();
+    let ([x, y, time, ftle, error, missing], bounds, of_y) = read();
+    assert_eq!((of_y.len(), (of_y[1] - of_y[0] - 0.25).abs() < 1e-12, (of_y[1] - of_y[2]).abs() < 1e-12), (8, true, true), "{of_y:?}");
     // Centres of pixels, upwards; the film is from the top.
     // Up to the rounding of the camera.
     let lie_at =
@@ -186,7 +187,7 @@ fn a_map_is_a_field_on_axes() {
     }
     // Twice as far away the domain is the middle quarter, and pixels of other places are left out.
     newest.put(map_frame(4, [8, 4], above(1.0, 0.5, 2.0)));
-    let ([x, y, _, ftle, ..], _) = read();
+    let ([x, y, _, ftle, ..], ..) = read();
     assert!(lie_at(&x, &[0.25, 0.75, 1.25, 1.75]) && lie_at(&y, &[0.25, 0.75]), "{x:?} {y:?}");
     assert_eq!(ftle[0], f64::from(film.ftle_mean[2 * 8 + 2]));
     for (camera, words) in [

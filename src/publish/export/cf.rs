@@ -108,6 +108,11 @@ impl CfFile {
                 None => put(&mut variable, &[("units", "1"), ("long_name", ["x", "y", "z"][k])])?,
             }
             put(&mut variable, &[("axis", AXES[k])])?;
+            if frame.of == Of::Pixels {
+                // What a mean is taken over.
+                put(&mut variable, &[("bounds", &bounds_of(name))])?;
+                file.add_variable::<f64>(&bounds_of(name), &[name, "window"])?;
+            }
         }
         for (k, name) in auxiliary.iter().enumerate() {
             let mut variable = file.add_variable::<f64>(name, &[&axes[1], &axes[0]])?;
@@ -205,6 +210,12 @@ impl CfFile {
                 values.iter_mut().for_each(|value| *value = axis.value(*value));
             }
             self.variable(name)?.put_values(&values, ..)?;
+            if self.frame.of == Of::Pixels {
+                // Pixels lie evenly; a single one has no neighbour to tell its width.
+                let half = if values.len() > 1 { 0.5 * (values[1] - values[0]) } else { 0.0 };
+                let bounds: Vec<f64> = values.iter().flat_map(|value| [value - half, value + half]).collect();
+                self.variable(&bounds_of(name))?.put_values(&bounds, ..)?;
+            }
         }
         if let Some(positions) = self.frame.georeference.positions.clone() {
             let (x, y) = (self.frame.coordinates(0), self.frame.coordinates(1));
@@ -268,6 +279,11 @@ impl CfFile {
         self.temporary.persist(path).map_err(|refused| refused.error)?;
         Ok(())
     }
+}
+
+/// Name of the bounds of an axis.
+fn bounds_of(axis: &str) -> String {
+    format!("{axis}_bounds")
 }
 
 fn put(variable: &mut VariableMut, attributes: &[(&str, &str)]) -> Result<(), netcdf::Error> {
