@@ -2,6 +2,7 @@
 
 use super::albedo::{albedo_preset, published_albedo};
 use super::error::{RenderError, require};
+use super::map_picture::MAP_TONE;
 use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -278,6 +279,11 @@ impl RenderSettings {
     /// Width over height.
     pub fn aspect(&self) -> f64 {
         self.width as f64 / self.height as f64
+    }
+
+    /// Tone map of pictures of a method: a map has its own.
+    pub fn tone_map_of(&self, method: Method) -> [f64; 3] {
+        if method == Method::Map { MAP_TONE } else { self.tone_map }
     }
 
     /// Checks every range.

@@ -4,7 +4,7 @@ use super::Settings;
 use super::record::{DomainRecord, FrameRecord};
 use super::setup::assemble;
 use crate::field::Domain;
-use crate::render::{Film, MAP_TONE, Method, Renderer, Scene, TransferSettings, map_radiance};
+use crate::render::{Film, Method, Renderer, Scene, TransferSettings, map_radiance};
 use serde::{Deserialize, Serialize};
 
 /// Colours of a bar.
@@ -36,8 +36,7 @@ impl ColorBar {
             [r, g, b, 1.0]
         };
         let film = Film { width: COLORS, height: 1, rgba: (0..COLORS).map(color).collect(), ..Film::default() };
-        let tone_map = if method == Method::Map { MAP_TONE } else { renderer.scene().settings.tone_map };
-        let colors = film.tone_mapped(tone_map).as_chunks().0.to_vec();
+        let colors = film.tone_mapped(renderer.scene().settings.tone_map_of(method)).as_chunks().0.to_vec();
         let unit = if time_unit.is_empty() { String::new() } else { format!("1/{time_unit}") };
         Self { colors, low, high, unit }
     }

@@ -15,7 +15,7 @@ use crate::field::Domain;
 use crate::flow::VelocitySource;
 use crate::progress;
 use crate::render::smooth::AUDIT_PAIRS;
-use crate::render::{Combine, MAP_TONE, Method};
+use crate::render::{Combine, Method};
 use crate::surrogate::{Learned, Predict, Trace};
 use crate::trust::{Gate, Strata};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -142,7 +142,7 @@ impl Run<'_> {
         Ok(Frame {
             record: Arc::new(record),
             film: Arc::new(work.rendered.film),
-            tone_map: if method == Method::Map { MAP_TONE } else { scene.render.tone_map },
+            tone_map: scene.render.tone_map_of(method),
             color_bar: Some(Arc::clone(&self.color_bar)),
             gate: frozen.is_some().then(|| Arc::new(gate)),
         })
