@@ -4,6 +4,7 @@ use super::footprint::MapTracer;
 use super::lines::RidgeLine;
 use super::make::{MOST_NODES, about, ridge_field, ridge_nodes, structures};
 use super::ridges::Strength;
+use super::smoothing::roughness;
 use super::surface_files::SurfacesAbout;
 use super::surfaces::Surfaces;
 use super::view::{View, is_geographic};
@@ -21,6 +22,8 @@ use std::time::Instant;
 const VOLUME_NODES: f64 = 1_048_576.0;
 /// Nodes traced at once, which bounds the memory beside the field.
 const AT_ONCE: usize = 1 << 19;
+/// Roughness from which on a grid is called too coarse.
+const ROUGH: f64 = 0.4;
 /// Pixels of the map on whose default grid lines are found.
 const MAP_PIXELS: usize = 800;
 
@@ -69,14 +72,16 @@ pub struct RidgesRecord {
     pub integration_difference: Option<f64>,
     /// Nodes along each axis.
     pub grid: Vec<usize>,
-    /// Percentile of the FTLE that the mean of a ridge reaches.
+    /// Percentile of the FTLE that `least` of a ridge reaches.
     pub percentile: f64,
     /// Percentile of the sharpness of ridge points below which they are cut off.
     pub sharpness: f64,
-    /// Least length of a line in nodes, or area of a surface in squares of nodes.
+    /// Length of a line in nodes, or area of a surface in squares of nodes, that reaches the percentile at least.
     pub least: f64,
     /// Standard deviation of the smoothing, in nodes.
     pub smoothing: f64,
+    /// Root mean square difference of the FTLE at a node from the mean of its two neighbours, as a share of the standard deviation of all nodes.
+    pub roughness: f64,
     /// Unit of the FTLE in the file.
     pub ftle_unit: String,
     /// Number of lines or surfaces.
@@ -129,14 +134,14 @@ pub fn find(
     let start = Instant::now();
     let kind = structures(map.direction);
     let missing = || MapError::AllMissing(super::make::when(moment));
-    let (ridges, seconds) = match size[..] {
+    let (ridges, seconds, roughness) = match size[..] {
         [nx, ny, nz] => {
             let volume = volume(domain, geographic, &mut tracer, [nx, ny, nz], &mut count)?;
             let traced = start.elapsed().as_secs_f64();
             if volume.values.iter().all(|v| !v.is_finite()) {
                 return Err(missing());
             }
-            (RidgesOfMoment::Surfaces(volume.surfaces(strength)), traced)
+            (RidgesOfMoment::Surfaces(volume.surfaces(strength)), traced, roughness(&volume.values, &size))
         }
         _ => {
             let view = view.map_err(MapError::Usage)?;
@@ -145,7 +150,8 @@ pub fn find(
             if field.values.iter().all(|v| !v.is_finite()) {
                 return Err(missing());
             }
-            (RidgesOfMoment::Lines(field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect()), traced)
+            let lines = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
+            (RidgesOfMoment::Lines(lines), traced, roughness(&field.values, &size))
         }
     };
     let rate = Rate::fitting(&plan.time_unit, tau);
@@ -170,6 +176,7 @@ pub fn find(
         sharpness: strength.sharpness,
         least: strength.extent,
         smoothing: strength.smoothing,
+        roughness,
         ftle_unit: rate.unit.clone(),
         ridges: number,
         points,
@@ -177,7 +184,19 @@ pub fn find(
         seconds: [seconds, start.elapsed().as_secs_f64() - seconds],
     };
     let about = SurfacesAbout { shared: about(moment, rate, level), time: moment.time, tau, direction: map.direction };
-    Ok(FoundRidges { ridges, about, record, notes: tracer.note.take().into_iter().collect() })
+    let notes = tracer.note.take().into_iter().chain(too_coarse(roughness)).collect();
+    Ok(FoundRidges { ridges, about, record, notes })
+}
+
+/// What is said of a grid that does not resolve the FTLE.
+fn too_coarse(roughness: f64) -> Option<String> {
+    (roughness > ROUGH).then(|| {
+        format!(
+            "the grid is too coarse for this FTLE: from node to node it changes by {:.0} % of its spread, so that ridges are lost, torn or misplaced; take \
+             a finer --grid, or a shorter tau",
+            100.0 * roughness
+        )
+    })
 }
 
 /// Nodes of a volume, evenly spaced, at least 16 along each axis.

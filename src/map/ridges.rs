@@ -27,11 +27,11 @@ pub struct Field {
 /// What counts as a ridge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Strength {
-    /// Percentile of the field, 0 to 100, that the mean over a ridge reaches. Points below three quarters of it belong to no ridge.
+    /// Percentile of the field, 0 to 100, that `extent` of a ridge reaches. Points below three quarters of the percentile belong to no ridge.
     pub percentile: f64,
     /// Percentile of the sharpness of all ridge points that are not cut off by their value, below which points belong to no ridge.
     pub sharpness: f64,
-    /// Least length of a line, in nodes; least area of a surface, in squares of nodes.
+    /// Least length of a line, in nodes, or area of a surface, in squares of nodes, on which the field reaches the percentile.
     pub extent: f64,
     /// Standard deviation of the Gaussian that smooths the field before it is differentiated, in nodes; 0 for none.
     pub smoothing: f64,
@@ -55,18 +55,29 @@ pub struct RidgePoint {
     pub sharpness: f64,
 }
 
-/// Gradient, eigenvector and eigenvalue at a node.
+/// Weight of the squared Hessians of a node's neighbours in its direction across a ridge, beside 1 for its own. At an inflection they alone know it;
+/// elsewhere they change little.
+pub(super) const NEIGHBOUR: f64 = 0.05;
+
+/// The direction across a ridge at a node.
 #[derive(Clone, Copy)]
 struct Shape {
-    /// Unit eigenvector of the smaller eigenvalue.
+    /// Unit eigenvector of the eigenvalue of the Hessian that is the larger one by magnitude, with a share of the neighbours' (see [`NEIGHBOUR`]).
     across: [f64; 2],
     /// Derivative along it.
     slope: f64,
-    /// The smaller eigenvalue.
-    curvature: f64,
-    /// Sum of both.
-    trace: f64,
 }
+
+/// The smoothed field, its largest magnitude, and its shape at each node. `None` at edges, beside missing nodes, and where the field is flat within
+/// rounding.
+struct Shapes {
+    smooth: Vec<f64>,
+    largest: f64,
+    at: Vec<Option<Shape>>,
+}
+
+/// Second derivatives, along x and x, x and y, y and y.
+type Hessian = [f64; 3];
 
 impl Field {
     /// Ridge lines.
@@ -79,85 +90,105 @@ impl Field {
         known.par_sort_unstable_by(f64::total_cmp);
         let largest = known[known.len() - 1].abs().max(known[0].abs());
         let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
-        let shapes: Vec<Option<Shape>> = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, largest)).collect();
+        let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, largest)).collect();
+        let shapes = Shapes { smooth, largest, at };
         let [nx, ny] = self.size;
         let mut found = Vec::new();
         for j in 0..ny.saturating_sub(1) {
             for i in 0..nx.saturating_sub(1) {
                 for triangle in [[[i, j], [i + 1, j], [i, j + 1]], [[i + 1, j], [i, j + 1], [i + 1, j + 1]]] {
-                    found.extend(self.cut(triangle, &shapes, &smooth, faint));
+                    found.extend(self.cut(triangle, &shapes, faint));
                 }
             }
         }
         let sharp = least_sharpness(found.iter().flatten().map(|(_, point)| point.sharpness), strength.sharpness);
         let mut segments = Segments::new();
         found.into_iter().filter(|ends| ends.iter().all(|(_, point)| point.sharpness >= sharp)).for_each(|ends| segments.add(ends));
-        let long = |line: &Vec<RidgePoint>| self.nodes_along(line) >= strength.extent;
-        let strong = |line: &Vec<RidgePoint>| line.iter().map(|p| p.value).sum::<f64>() / line.len() as f64 >= least;
-        segments.lines().into_iter().filter(|line| long(line) && strong(line)).collect()
+        segments.lines().into_iter().filter(|line| self.strong_length(line, least) >= strength.extent).collect()
     }
 
-    /// Length of a line, in nodes.
-    fn nodes_along(&self, line: &[RidgePoint]) -> f64 {
+    /// Length of a line where the field is `least` or more, in nodes.
+    fn strong_length(&self, line: &[RidgePoint], least: f64) -> f64 {
         let step = |k: usize, pair: &[RidgePoint]| (pair[1].place[k] - pair[0].place[k]) / self.step[k];
-        line.windows(2).map(|pair| step(0, pair).hypot(step(1, pair))).sum()
+        let is_strong = |pair: &&[RidgePoint]| (pair[0].value + pair[1].value) / 2.0 >= least;
+        line.windows(2).filter(is_strong).map(|pair| step(0, pair).hypot(step(1, pair))).sum()
     }
 
-    /// Derivatives at a node by central differences. `None` at edges, beside missing nodes, and where the field is flat within rounding.
+    /// Derivatives at a node by central differences.
     fn shape(&self, field: &[f64], node: usize, largest: f64) -> Option<Shape> {
         let [nx, ny] = self.size;
         let (i, j) = (node % nx, node / nx);
         if i == 0 || j == 0 || i + 1 >= nx || j + 1 >= ny {
             return None;
         }
-        let at = |di: isize, dj: isize| field[(node as isize + di + dj * nx as isize) as usize];
-        let near = [-1, 0, 1].map(|dj| [-1, 0, 1].map(|di| at(di, dj)));
-        if !near.iter().flatten().all(|v| v.is_finite()) {
+        let near = [node - nx, node, node + nx].map(|row| [field[row - 1], field[row], field[row + 1]]);
+        let [hx, hy] = self.lengths(node);
+        if !(near.iter().flatten().all(|v| v.is_finite()) && hx > 0.0) {
             return None;
         }
-        let [hx, hy] = [0, 1].map(|k| self.step[k] * self.scale[j][k]);
-        let gradient = [(near[1][2] - near[1][0]) / (2.0 * hx), (near[2][1] - near[0][1]) / (2.0 * hy)];
-        let xx = (near[1][2] - 2.0 * near[1][1] + near[1][0]) / (hx * hx);
-        let yy = (near[2][1] - 2.0 * near[1][1] + near[0][1]) / (hy * hy);
-        let xy = (near[2][2] - near[2][0] - near[0][2] + near[0][0]) / (4.0 * hx * hy);
-        let (mean, half) = ((xx + yy) / 2.0, (xx - yy) / 2.0);
-        let curvature = mean - half.hypot(xy);
-        // Rounding of integrations in f32, whose second difference is no curvature.
-        let rounding = 1e-5 * largest / hx.max(hy).powi(2);
-        if !(curvature < -rounding && hx > 0.0) {
-            return None;
+        let mut sum = square(self.hessian(field, node));
+        let neighbours = [(i > 1, node - 1), (i + 2 < nx, node + 1), (j > 1, node - nx), (j + 2 < ny, node + nx)];
+        for (_, neighbour) in neighbours.into_iter().filter(|(is_within, _)| *is_within) {
+            let near = square(self.hessian(field, neighbour));
+            if near.iter().all(|v| v.is_finite()) {
+                (0..3).for_each(|k| sum[k] += NEIGHBOUR * near[k]);
+            }
         }
-        // Both rows of H - curvature are orthogonal to the eigenvector; the longer one is exact to rounding.
-        let (a, b) = ([xy, curvature - xx], [curvature - yy, xy]);
+        let [xx, xy, yy] = sum;
+        let [_, larger] = eigenvalues(sum);
+        let rounding = self.rounding(node, largest).powi(2);
+        // Both rows of the sum minus the eigenvalue are orthogonal to the eigenvector; the longer one is exact to rounding.
+        let (a, b) = ([xy, larger - xx], [larger - yy, xy]);
         let longer = if a[0].hypot(a[1]) > b[0].hypot(b[1]) { a } else { b };
         let length = longer[0].hypot(longer[1]);
         // Equal eigenvalues: a peak has no direction across.
-        if length <= rounding {
+        if larger <= rounding || length <= rounding {
             return None;
         }
         let across = longer.map(|c| c / length);
-        Some(Shape { across, slope: gradient[0] * across[0] + gradient[1] * across[1], curvature, trace: xx + yy })
+        let gradient = [(near[1][2] - near[1][0]) / (2.0 * hx), (near[2][1] - near[0][1]) / (2.0 * hy)];
+        Some(Shape { across, slope: dot(gradient, across) })
+    }
+
+    /// Distances of nodes in the row of a node.
+    fn lengths(&self, node: usize) -> [f64; 2] {
+        [0, 1].map(|k| self.step[k] * self.scale[node / self.size[0]][k])
+    }
+
+    /// What rounding of integrations in f32 makes of second differences, which is no curvature.
+    fn rounding(&self, node: usize, largest: f64) -> f64 {
+        let [hx, hy] = self.lengths(node);
+        1e-5 * largest / hx.max(hy).powi(2)
+    }
+
+    /// Second derivatives at a node within the grid.
+    fn hessian(&self, field: &[f64], node: usize) -> Hessian {
+        let ([hx, hy], nx) = (self.lengths(node), self.size[0]);
+        let second = |stride: usize, h: f64| (field[node + stride] - 2.0 * field[node] + field[node - stride]) / (h * h);
+        let (same, opposite) = (field[node + nx + 1] + field[node - nx - 1], field[node + nx - 1] + field[node - nx + 1]);
+        [second(1, hx), (same - opposite) / (4.0 * hx * hy), second(nx, hy)]
     }
 
     /// The segment of a triangle of nodes, whose ends are the crossings of two of its sides.
-    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &[Option<Shape>], smooth: &[f64], faint: f64) -> Option<[(Edge, RidgePoint); 2]> {
+    fn cut(&self, triangle: [[usize; 2]; 3], shapes: &Shapes, faint: f64) -> Option<[(Edge, RidgePoint); 2]> {
         let nx = self.size[0];
-        let at = |[i, j]: [usize; 2]| shapes[j * nx + i];
+        let at = |[i, j]: [usize; 2]| shapes.at[j * nx + i];
         let [Some(a), Some(b), Some(c)] = triangle.map(at) else { return None };
         // Sides on which directions differ by 60 degrees or more belong to no common ridge. Below, the three signs cannot contradict each other.
         if [(a, b), (b, c), (c, a)].iter().any(|(p, q)| dot(p.across, q.across).abs() <= 0.5) {
             return None;
         }
-        let mut ends = [(0, 1), (1, 2), (0, 2)].into_iter().filter_map(|(p, q)| self.crossing(triangle[p], triangle[q], shapes, smooth));
+        let mut ends = [(0, 1), (1, 2), (0, 2)].into_iter().filter_map(|(p, q)| self.crossing(triangle[p], triangle[q], shapes));
         let pair = [ends.next()?, ends.next()?];
         pair.iter().all(|(_, point)| point.value >= faint).then_some(pair)
     }
 
-    /// Zero of the slope on a side, by the cubic through four nodes in a row, else linear.
-    fn crossing(&self, from: [usize; 2], to: [usize; 2], shapes: &[Option<Shape>], smooth: &[f64]) -> Option<(Edge, RidgePoint)> {
+    /// Zero of the slope on a side, by the cubic through four nodes in a row, else linear. `None` if it is no ridge.
+    fn crossing(&self, from: [usize; 2], to: [usize; 2], shapes: &Shapes) -> Option<(Edge, RidgePoint)> {
+        let Shapes { smooth, largest, at } = shapes;
         let nx = self.size[0];
         let (first, second) = ((from[1] * nx + from[0]), (to[1] * nx + to[0]));
-        let (a, b) = (shapes[first]?, shapes[second]?);
+        let (a, b) = (at[first]?, at[second]?);
         // In the direction of the first node.
         let slope = |shape: &Shape| shape.slope * dot(shape.across, a.across).signum();
         let (low, high) = (a.slope, slope(&b));
@@ -166,7 +197,7 @@ impl Field {
         }
         let stride = second as isize - first as isize;
         let beyond = |node: isize| {
-            let shape = usize::try_from(node).ok().and_then(|node| shapes.get(node)).copied().flatten()?;
+            let shape = usize::try_from(node).ok().and_then(|node| at.get(node)).copied().flatten()?;
             (dot(shape.across, a.across).abs() > 0.5).then(|| slope(&shape))
         };
         let t = match (beyond(first as isize - stride), beyond(second as isize + stride)) {
@@ -174,11 +205,13 @@ impl Field {
             _ => low / (low - high),
         };
         let between = |a: f64, b: f64| a + t * (b - a);
-        if between(a.trace, b.trace) > 0.0 {
+        let [near, far] = [first, second].map(|node| self.hessian(smooth, node));
+        let [smaller, larger] = eigenvalues([0, 1, 2].map(|k| between(near[k], far[k])));
+        if smaller >= -self.rounding(first, *largest) || smaller + larger > 0.0 {
             return None;
         }
         let place = [0, 1].map(|k| self.origin[k] + self.step[k] * between(from[k] as f64, to[k] as f64));
-        let point = RidgePoint { place, value: between(smooth[first], smooth[second]), sharpness: -between(a.curvature, b.curvature) };
+        let point = RidgePoint { place, value: between(smooth[first], smooth[second]), sharpness: -smaller };
         // Along x, along y, and the diagonal.
         let kind = if from[1] == to[1] {
             0
@@ -189,6 +222,17 @@ impl Field {
         };
         Some((3 * first.min(second) as Edge + kind, point))
     }
+}
+
+/// Square of a symmetric matrix: its eigenvectors, and squares of its eigenvalues.
+fn square([xx, xy, yy]: Hessian) -> Hessian {
+    [xx * xx + xy * xy, xy * (xx + yy), yy * yy + xy * xy]
+}
+
+/// The smaller eigenvalue and the larger one.
+fn eigenvalues([xx, xy, yy]: Hessian) -> [f64; 2] {
+    let (mean, half) = ((xx + yy) / 2.0, ((xx - yy) / 2.0).hypot(xy));
+    [mean - half, mean + half]
 }
 
 fn dot(a: [f64; 2], b: [f64; 2]) -> f64 {

@@ -39,17 +39,28 @@ pub struct Surface {
     pub triangles: usize,
     /// Area, in squares of nodes.
     pub area: f64,
-    /// Mean of the field over the area.
-    pub mean: f64,
+    /// The part of the area on which the field reaches the percentile.
+    pub strong_area: f64,
 }
 
 /// Corners of a cell, as bits of x, y and z, of the tetrahedra around its diagonal.
 const TETRAHEDRA: [[usize; 4]; 6] = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]];
 
 /// Vertices and triangles before they are filtered.
+#[derive(Default)]
 struct Mesh {
+    points: Vec<SurfacePoint>,
+    triangles: Vec<[u32; 3]>,
+    /// Numbers of the vertices on the edges that begin in the last layer of nodes and lie in it, eight places a node.
+    last: Vec<u32>,
+}
+
+/// The mesh of some layers of cells.
+struct Slab {
     /// Numbers of the vertices on the edges that begin in the layer of cells and in the one above, eight places a node.
     numbers: [Vec<u32>; 2],
+    /// Those that begin in the first layer.
+    first: Vec<u32>,
     points: Vec<SurfacePoint>,
     triangles: Vec<[u32; 3]>,
 }
@@ -69,23 +80,13 @@ impl Volume {
         known.par_sort_unstable_by(f64::total_cmp);
         let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
         drop(known);
-        let [nx, ny, nz] = self.size;
-        let layer = || vec![NEW; 8 * nx * ny];
-        let mut mesh = Mesh { numbers: [layer(), layer()], points: Vec::new(), triangles: Vec::new() };
-        for k in 0..nz - 1 {
-            for cell in 0..(nx - 1) * (ny - 1) {
-                self.cut([cell % (nx - 1), cell / (nx - 1), k], &shapes, faint, &mut mesh);
-            }
-            mesh.numbers.swap(0, 1);
-            mesh.numbers[1].fill(NEW);
-        }
-        let Mesh { points, mut triangles, .. } = mesh;
+        let Mesh { points, mut triangles, .. } = self.mesh(&shapes, faint);
         let sharp = least_sharpness(points.iter().map(|point| point.sharpness), strength.sharpness);
         triangles.retain(|triangle| triangle.iter().all(|n| points[*n as usize].sharpness >= sharp));
         let mut kept: Vec<(Surface, Vec<[u32; 3]>)> = pieces(&triangles)
             .into_par_iter()
-            .map(|piece| (self.measured(&points, &piece), piece))
-            .filter(|(surface, _)| surface.area >= strength.extent && surface.mean >= least)
+            .map(|piece| (self.measured(&points, &piece, least), piece))
+            .filter(|(surface, _)| surface.strong_area >= strength.extent)
             .collect();
         kept.sort_by(|(a, _), (b, _)| b.area.total_cmp(&a.area));
         let mut found = Surfaces::default();
@@ -106,9 +107,34 @@ impl Volume {
         found
     }
 
-    /// Area and mean of triangles.
-    fn measured(&self, points: &[SurfacePoint], triangles: &[[u32; 3]]) -> Surface {
-        let (mut area, mut sum) = (0.0, 0.0);
+    /// The mesh of all cells, by slabs on all threads.
+    fn mesh(&self, shapes: &Shapes, faint: f64) -> Mesh {
+        let layers: Vec<usize> = (0..self.size[2] - 1).collect();
+        let at_once = layers.len().div_ceil(4 * rayon::current_num_threads()).max(4);
+        let slabs: Vec<Slab> = layers.par_chunks(at_once).map(|layers| self.slab(layers, shapes, faint)).collect();
+        slabs.into_iter().fold(Mesh::default(), Mesh::and)
+    }
+
+    fn slab(&self, layers: &[usize], shapes: &Shapes, faint: f64) -> Slab {
+        let [nx, ny, _] = self.size;
+        let layer = || vec![NEW; 8 * nx * ny];
+        let mut slab = Slab { numbers: [layer(), layer()], first: Vec::new(), points: Vec::new(), triangles: Vec::new() };
+        for &k in layers {
+            for cell in 0..(nx - 1) * (ny - 1) {
+                self.cut([cell % (nx - 1), cell / (nx - 1), k], shapes, faint, &mut slab);
+            }
+            slab.numbers.swap(0, 1);
+            let below = std::mem::replace(&mut slab.numbers[1], layer());
+            if k == layers[0] {
+                slab.first = below;
+            }
+        }
+        slab
+    }
+
+    /// What a surface of these triangles is; `least` is the percentile.
+    fn measured(&self, points: &[SurfacePoint], triangles: &[[u32; 3]], least: f64) -> Surface {
+        let (mut area, mut strong_area) = (0.0, 0.0);
         for triangle in triangles {
             let [a, b, c] = triangle.map(|n| points[n as usize]);
             let side = |to: SurfacePoint| -> [f64; 3] { std::array::from_fn(|k| (to.place[k] - a.place[k]) / self.step[k]) };
@@ -116,13 +142,15 @@ impl Volume {
             let normal = [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx];
             let part = normal.iter().map(|c| c * c).sum::<f64>().sqrt() / 2.0;
             area += part;
-            sum += part * (a.value + b.value + c.value) / 3.0;
+            if (a.value + b.value + c.value) / 3.0 >= least {
+                strong_area += part;
+            }
         }
-        Surface { triangles: triangles.len(), area, mean: sum / area }
+        Surface { triangles: triangles.len(), area, strong_area }
     }
 
     /// Adds the triangles of a cell.
-    fn cut(&self, [i, j, k]: [usize; 3], shapes: &Shapes, faint: f64, mesh: &mut Mesh) {
+    fn cut(&self, [i, j, k]: [usize; 3], shapes: &Shapes, faint: f64, slab: &mut Slab) {
         let [nx, ny, _] = self.size;
         let node = |corner: usize| (i + (corner & 1)) + nx * ((j + (corner >> 1 & 1)) + ny * (k + (corner >> 2)));
         // All tetrahedra have both ends of the diagonal.
@@ -145,15 +173,15 @@ impl Volume {
             let mut vertex = |p: usize, q: usize| {
                 let (from, to) = (p.min(q), p.max(q));
                 let place = 8 * (node(from) % (nx * ny)) + (p ^ q);
-                let number = mesh.numbers[from >> 2][place];
+                let number = slab.numbers[from >> 2][place];
                 if number != NEW {
                     return (number != NONE).then_some(number);
                 }
                 let point = self.crossing(node(from), node(to), p ^ q, shapes).filter(|point| point.value >= faint);
                 // Seven edges a node, of at most 2^24 nodes.
-                mesh.numbers[from >> 2][place] = if point.is_some() { mesh.points.len() as u32 } else { NONE };
-                mesh.points.extend(point);
-                point.map(|_| mesh.points.len() as u32 - 1)
+                slab.numbers[from >> 2][place] = if point.is_some() { slab.points.len() as u32 } else { NONE };
+                slab.points.extend(point);
+                point.map(|_| slab.points.len() as u32 - 1)
             };
             let ring = match count {
                 [1, 3] => [vertex(below[0], above[0]), vertex(below[0], above[1]), vertex(below[0], above[2]), None],
@@ -163,14 +191,13 @@ impl Volume {
             };
             for triangle in [[ring[0], ring[1], ring[2]], [ring[0], ring[2], ring[3]]] {
                 if let [Some(p), Some(q), Some(r)] = triangle {
-                    mesh.triangles.push([p, q, r]);
+                    slab.triangles.push([p, q, r]);
                 }
             }
         }
     }
 
-    /// Zero of the slope on an edge, by the cubic through four nodes in a row, else linear. `None` where the smallest eigenvalue is not the largest by
-    /// magnitude.
+    /// Zero of the slope on an edge, by the cubic through four nodes in a row, else linear. `None` if it is no ridge.
     fn crossing(&self, from: usize, to: usize, axes: usize, shapes: &Shapes) -> Option<SurfacePoint> {
         let (a, b) = (shapes.at[from].as_ref()?, shapes.at[to].as_ref()?);
         let (low, high) = (a.slope, slope(b, a));
@@ -184,15 +211,30 @@ impl Volume {
             (Some(before), Some(after)) => cubic_zero([before, low, high, after]),
             _ => low / (low - high),
         };
-        let between = |a: f64, b: f64| a + t * (b - a);
-        if between(a.balance, b.balance) > 0.0 {
-            return None;
-        }
+        let sharpness = self.sharpness(shapes, [from, to], t)?;
         let [nx, ny, _] = self.size;
         let start = [from % nx, from / nx % ny, from / (nx * ny)];
         let place = std::array::from_fn(|k| self.origin[k] + self.step[k] * (start[k] as f64 + if axes >> k & 1 == 1 { t } else { 0.0 }));
-        let value = between(shapes.smooth[from], shapes.smooth[to]);
-        Some(SurfacePoint { place, value, sharpness: -between(a.curvature, b.curvature) })
+        let value = shapes.smooth[from] + t * (shapes.smooth[to] - shapes.smooth[from]);
+        Some(SurfacePoint { place, value, sharpness })
+    }
+}
+
+impl Mesh {
+    /// The mesh with the slab above, which shares the vertices on the layer of nodes between them.
+    fn and(mut self, slab: Slab) -> Self {
+        let mut numbers = vec![NEW; slab.points.len()];
+        for (above, below) in slab.first.iter().zip(&self.last).filter(|(above, below)| **above < NONE && **below < NONE) {
+            numbers[*above as usize] = *below;
+        }
+        for (number, point) in numbers.iter_mut().zip(slab.points).filter(|(number, _)| **number == NEW) {
+            *number = self.points.len() as u32;
+            self.points.push(point);
+        }
+        let [last, _] = slab.numbers;
+        self.last = last.into_iter().map(|number| if number < NONE { numbers[number as usize] } else { number }).collect();
+        self.triangles.extend(slab.triangles.into_iter().map(|triangle| triangle.map(|number| numbers[number as usize])));
+        self
     }
 }
 

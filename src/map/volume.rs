@@ -1,5 +1,6 @@
 //! A field in space and its second-order shape, by which ridge surfaces are found.
 
+use super::ridges::NEIGHBOUR;
 use super::smoothing::smoothed;
 use rayon::prelude::*;
 
@@ -21,23 +22,21 @@ pub struct Volume {
     pub rounding: f64,
 }
 
-/// Gradient, eigenvector and eigenvalue at a node.
+/// The direction across a ridge at a node.
 #[derive(Clone, Copy)]
 pub(super) struct Shape {
-    /// Unit eigenvector of the smallest eigenvalue of the Hessian.
+    /// Unit eigenvector of the eigenvalue of the Hessian that is the largest by magnitude, with a share of the neighbours' (see [`NEIGHBOUR`]).
     pub(super) across: [f64; 3],
     /// Derivative along it; never 0, so that its sign turns with the direction.
     pub(super) slope: f64,
-    /// The smallest eigenvalue.
-    pub(super) curvature: f64,
-    /// Sum of the smallest and the largest eigenvalue: negative where the smallest is the largest by magnitude.
-    pub(super) balance: f64,
 }
 
 /// The smoothed field, and its shape at each node. `None` at faces of the grid, beside missing nodes, and where the field is flat within rounding.
 pub(super) struct Shapes {
     pub(super) smooth: Vec<f64>,
     pub(super) at: Vec<Option<Shape>>,
+    /// Rounding of the smoothed field.
+    rounding: f64,
 }
 
 impl Volume {
@@ -46,7 +45,24 @@ impl Volume {
         let largest = smooth.par_iter().map(|v| v.abs()).filter(|v| v.is_finite()).reduce(|| 0.0, f64::max);
         let rounding = (1e-5 * largest).max(self.rounding);
         let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, rounding)).collect();
-        Shapes { smooth, at }
+        Shapes { smooth, at, rounding }
+    }
+
+    /// Sharpness, minus the smallest eigenvalue of the Hessian, at the share `t` of the way between two nodes with shapes. `None` unless that eigenvalue
+    /// is negative beyond rounding, and the largest by magnitude.
+    pub(super) fn sharpness(&self, shapes: &Shapes, [from, to]: [usize; 2], t: f64) -> Option<f64> {
+        let [a, b] = [from, to].map(|node| self.hessian(&shapes.smooth, node, self.lengths(node)));
+        let (values, vectors) = eigen(std::array::from_fn(|k| std::array::from_fn(|l| a[k][l] + t * (b[k][l] - a[k][l]))));
+        let smallest = (0..3).min_by(|k, l| values[*k].total_cmp(&values[*l]))?;
+        let noise = noise(shapes.rounding, column(&vectors, smallest), self.lengths(from));
+        let is_ridge = values[smallest] < -noise && values.iter().all(|value| *value <= -values[smallest]);
+        is_ridge.then_some(-values[smallest])
+    }
+
+    /// Distances of nodes in the row of a node.
+    fn lengths(&self, node: usize) -> [f64; 3] {
+        let row = node / self.size[0] % self.size[1];
+        std::array::from_fn(|k| self.step[k] * self.scale[row][k])
     }
 
     /// Derivatives at a node by central differences.
@@ -56,43 +72,67 @@ impl Volume {
         if (0..3).any(|k| at[k] == 0 || at[k] + 1 >= self.size[k]) {
             return None;
         }
-        let strides = [1, nx, nx * ny];
         // 27 nodes: all that the derivatives take, and those between them, so that no missing node is near.
         let known = |k: usize| field[node + k % 3 + (k / 3 % 3) * nx + (k / 9) * nx * ny - (1 + nx + nx * ny)].is_finite();
-        if !(0..27).all(known) {
+        let h = self.lengths(node);
+        if !(0..27).all(known) || !h.iter().all(|h| *h > 0.0) {
             return None;
         }
-        let h: [f64; 3] = std::array::from_fn(|k| self.step[k] * self.scale[at[1]][k]);
-        if !h.iter().all(|h| *h > 0.0) {
-            return None;
-        }
-        let gradient: [f64; 3] = std::array::from_fn(|k| (field[node + strides[k]] - field[node - strides[k]]) / (2.0 * h[k]));
-        let hessian: [[f64; 3]; 3] = std::array::from_fn(|k| {
-            std::array::from_fn(|l| {
-                let (p, q) = (strides[k], strides[l]);
-                if k == l {
-                    (field[node + p] - 2.0 * field[node] + field[node - p]) / (h[k] * h[k])
-                } else {
-                    let (same, opposite) = (field[node + p + q] + field[node - p - q], field[node + p - q] + field[node + q - p]);
-                    (same - opposite) / (4.0 * h[k] * h[l])
+        let mut sum = square(self.hessian(field, node, h));
+        for k in 0..3 {
+            let [low, high] = [at[k] > 1, at[k] + 2 < self.size[k]];
+            for (_, neighbour) in
+                [(low, node - self.stride(k)), (high, node + self.stride(k))].into_iter().filter(|(is_within, _)| *is_within)
+            {
+                let near = square(self.hessian(field, neighbour, h));
+                if near.as_flattened().iter().all(|v| v.is_finite()) {
+                    (0..9).for_each(|n| sum[n / 3][n % 3] += NEIGHBOUR * near[n / 3][n % 3]);
                 }
-            })
-        });
-        let (values, vectors) = eigen(hessian);
-        let mut order = [0, 1, 2];
-        order.sort_by(|a, b| values[*a].total_cmp(&values[*b]));
-        let [smallest, middle, largest] = order.map(|k| values[k]);
-        let across: [f64; 3] = std::array::from_fn(|k| vectors[k][order[0]]);
-        // What rounding of the values makes of the second difference along this direction is no curvature. Equal eigenvalues have no direction: the
-        // middle of a tube, and a peak.
-        let noise = rounding * (0..3).map(|k| (across[k] / h[k]).powi(2)).sum::<f64>();
-        if !(smallest < -noise && middle - smallest > noise) {
+            }
+        }
+        let (values, vectors) = eigen(sum);
+        let largest = (0..3).max_by(|k, l| values[*k].total_cmp(&values[*l]))?;
+        let across = column(&vectors, largest);
+        if values[largest] <= noise(rounding, across, h).powi(2) {
             return None;
         }
-        let slope: f64 = (0..3).map(|k| gradient[k] * across[k]).sum();
-        let slope = if slope == 0.0 { f64::MIN_POSITIVE } else { slope };
-        Some(Shape { across, slope, curvature: smallest, balance: smallest + largest })
+        let gradient = |k: usize| (field[node + self.stride(k)] - field[node - self.stride(k)]) / (2.0 * h[k]);
+        let slope: f64 = (0..3).map(|k| gradient(k) * across[k]).sum();
+        Some(Shape { across, slope: if slope == 0.0 { f64::MIN_POSITIVE } else { slope } })
     }
+
+    /// Second derivatives at a node within the grid.
+    fn hessian(&self, field: &[f64], node: usize, h: [f64; 3]) -> [[f64; 3]; 3] {
+        let second = |k: usize, l: usize| {
+            let (p, q) = (self.stride(k), self.stride(l));
+            if k == l {
+                (field[node + p] - 2.0 * field[node] + field[node - p]) / (h[k] * h[k])
+            } else {
+                let (same, opposite) = (field[node + p + q] + field[node - p - q], field[node + p - q] + field[node + q - p]);
+                (same - opposite) / (4.0 * h[k] * h[l])
+            }
+        };
+        let [xy, xz, yz] = [second(0, 1), second(0, 2), second(1, 2)];
+        [[second(0, 0), xy, xz], [xy, second(1, 1), yz], [xz, yz, second(2, 2)]]
+    }
+
+    fn stride(&self, axis: usize) -> usize {
+        self.size[..axis].iter().product()
+    }
+}
+
+/// What rounding of the values makes of the second difference along a direction, which is no curvature.
+fn noise(rounding: f64, direction: [f64; 3], h: [f64; 3]) -> f64 {
+    rounding * (0..3).map(|k| (direction[k] / h[k]).powi(2)).sum::<f64>()
+}
+
+/// Square of a symmetric matrix: its eigenvectors, and squares of its eigenvalues.
+fn square(a: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    std::array::from_fn(|k| std::array::from_fn(|l| (0..3).map(|m| a[k][m] * a[m][l]).sum()))
+}
+
+fn column(vectors: &[[f64; 3]; 3], k: usize) -> [f64; 3] {
+    [vectors[0][k], vectors[1][k], vectors[2][k]]
 }
 
 /// Eigenvalues of a symmetric matrix, and its unit eigenvectors as columns, by cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5).

@@ -43,6 +43,33 @@ fn the_saddle_is_exact_to_a_hundredth_of_a_cell() {
     }
 }
 
+/// The ridge falls to half within 0.7 to 1.2 nodes, and nodes about its inflections know no direction across it.
+#[test]
+fn lines_as_narrow_as_a_node_hold_together() {
+    let step = 0.025;
+    for (angle, shift) in [(0.0, 0.0137), (0.4, 0.003), (1.1, -0.011), (TURN / 8.0, 0.0049)] {
+        let (sine, cosine) = f64::sin_cos(angle);
+        let across = |x: f64, y: f64| cosine * x + sine * y - shift;
+        let lines = |width: f64, smoothing: f64| {
+            field([-1.0, -1.0], step, [81, 81], |x, y| (-(across(x, y) / width).powi(2)).exp()).ridges(&Strength { smoothing, ..ALL })
+        };
+        let length = |line: &[RidgePoint]| {
+            line.windows(2).map(|pair| (pair[1].place[0] - pair[0].place[0]).hypot(pair[1].place[1] - pair[0].place[1])).sum::<f64>()
+        };
+        let whole = length(&lines(0.1, 0.0)[0]);
+        for (width, smoothing) in [(0.02, 0.0), (0.02, 0.5), (0.035, 0.0), (0.035, 0.5)] {
+            let found = lines(width, smoothing);
+            let worst = found.iter().flatten().map(|p| across(p.place[0], p.place[1]).abs()).fold(0.0, f64::max) / step;
+            let share = length(&found[0]) / whole;
+            println!(
+                "angle {angle:.2}, width {width}, smoothing {smoothing}: {:.1} % of the length, worst {worst:.2} cells",
+                100.0 * share
+            );
+            assert!(found.len() == 1 && share > 0.99 && worst < 0.25, "{} pieces", found.len());
+        }
+    }
+}
+
 /// The same saddle as data on a grid, through the integration of the program.
 #[test]
 fn the_saddle_of_a_traced_grid_is_exact_to_a_hundredth_of_a_cell() {

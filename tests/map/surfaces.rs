@@ -71,6 +71,26 @@ fn planes_are_exact_to_a_hundredth_of_a_cell() {
     }
 }
 
+/// The ridge falls to half within 0.7 to 1.2 nodes, and nodes about its inflections know no direction across it.
+#[test]
+fn sheets_as_narrow_as_a_node_hold_together() {
+    let sheet = |normal: Vector, shift: f64, width: f64| volume(-0.5, 0.025, 41, |p| (-((dot(normal, p) - shift) / width).powi(2)).exp());
+    for (normal, shift) in PLANES {
+        let normal = unit(normal);
+        let whole = sheet(normal, shift, 0.1).surfaces(&ALL).surfaces[0].area;
+        for (width, smoothing) in [(0.02, 0.0), (0.02, 0.5), (0.035, 0.0), (0.035, 0.5)] {
+            let found = sheet(normal, shift, width).surfaces(&Strength { smoothing, ..ALL });
+            let worst = found.points.iter().map(|p| (dot(normal, p.place) - shift).abs()).fold(0.0, f64::max) / 0.025;
+            let share = found.surfaces[0].area / whole;
+            println!(
+                "normal {normal:.2?}, width {width}, smoothing {smoothing}: {:.1} % of the area, worst {worst:.2} cells",
+                100.0 * share
+            );
+            assert!(found.surfaces.len() == 1 && share > 0.99 && worst < 0.25, "{} pieces", found.surfaces.len());
+        }
+    }
+}
+
 /// Velocities on a grid from -1.25 to 1.25, and their log-stretch over `tau` at nodes around the origin, divided by it.
 fn traced(velocity: impl Fn(Vector) -> Vector, map: &FlowMap) -> Volume {
     const NODES: usize = 101;
@@ -154,6 +174,12 @@ fn shells_close_and_filters_choose() {
     assert_eq!(count(&two, Strength { sharpness: 30.0, ..ALL }), 1, "the weaker one is less sharp");
     assert_eq!(count(&two, Strength { extent: 1000.0, ..ALL }), 1, "the smaller one has 700 squares");
     assert_eq!(count(&two, Strength { extent: 4000.0, ..ALL }), 0);
+    // A faint rest does not take a strong part along: of a shell whose strength falls from pole to pole, what is above the percentile counts.
+    let uneven = volume(-1.0, 0.04, 51, |p| (1.0 + 0.2 * p[2]) * profile(radius(p), 0.7, 0.12));
+    let strong = uneven.surfaces(&Strength { percentile: 97.0, ..ALL });
+    let [area, strong_area] = [strong.surfaces[0].area, strong.surfaces[0].strong_area];
+    assert!(strong.surfaces.len() == 1 && strong_area < 0.9 * area, "{area} {strong_area}");
+    assert_eq!(count(&uneven, Strength { percentile: 97.0, extent: strong_area + 1.0, ..ALL }), 0);
     // A hole cuts the shell open.
     two.values[(25 * 51 + 25) * 51 + 25 + 17] = f32::NAN;
     let cut = two.surfaces(&Strength { percentile: 90.0, ..ALL });
