@@ -62,7 +62,7 @@ pub struct Options {
     /// Write the ridge lines: .geojson, .nc (CF geometries) or .vtk. Includes --ridges.
     #[arg(long, value_name = "FILE")]
     lines: Option<PathBuf>,
-    /// Percentile of the FTLE that the mean over a ridge line reaches.
+    /// Percentile of the FTLE that --ridge-length of a ridge line reaches.
     #[arg(long, value_name = "P", default_value_t = Strength::LINES.percentile, value_parser = percentile)]
     ridge_percentile: f64,
     /// Least length of a ridge line, in nodes of the ridge grid.

@@ -34,16 +34,16 @@ pub struct Options {
     /// forward (repelling structures) or backward (attracting ones). Default: the scene's.
     #[arg(long, value_parser = direction)]
     direction: Option<Direction>,
-    /// Percentile of the FTLE that the mean over a ridge reaches; points below three quarters of it are cut off.
+    /// Percentile of the FTLE that --area or --length of a ridge reaches; points below three quarters of it are cut off.
     #[arg(long, value_name = "P", default_value_t = Strength::SURFACES.percentile, value_parser = percentile)]
     percentile: f64,
     /// Percentile of the sharpness of these points below which they are cut off.
     #[arg(long, value_name = "P", default_value_t = Strength::SURFACES.sharpness, value_parser = percentile)]
     sharpness: f64,
-    /// Least area of a surface, in squares of nodes. Default: 100.
+    /// Least area of a surface that reaches the percentile, in squares of nodes. Default: 100.
     #[arg(long, value_name = "SQUARES", value_parser = not_negative)]
     area: Option<f64>,
-    /// Least length of a line, in nodes. Default: 30.
+    /// Least length of a line that reaches the percentile, in nodes. Default: 30.
     #[arg(long, value_name = "NODES", value_parser = not_negative)]
     length: Option<f64>,
     /// Standard deviation of the smoothing before derivatives, in nodes; 0 for none. Default: 1 for surfaces, 2 for lines.
