@@ -115,7 +115,7 @@ fn main() {
             let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             combine.combine(&input).unwrap();
             let began = gpu.mark().unwrap();
-            combine.finish(8, 1e-4, 1e-5).unwrap();
+            combine.finish(8, 1e-4, 1e-5).unwrap().measured().unwrap();
             finished = finished.min(gpu.milliseconds(&began, &gpu.mark().unwrap()).unwrap());
         }
         println!("| {name} | {combined:.3} | {finished:.3} |");

@@ -25,7 +25,7 @@ extern "C" __global__ void __launch_bounds__(256) combine_normal(const Regressio
 
 // One block.
 extern "C" __global__ void __launch_bounds__(256) combine_solve(const Regression regression) {
-    __shared__ double memory[NORMAL_SUMS];
+    __shared__ double memory[SOLVE_MEMORY];
     solve_normal(Block{}, regression, memory);
 }
 
@@ -41,9 +41,10 @@ extern "C" __global__ void __launch_bounds__(256)
 combine_rows(const Quarters fine, float* __restrict__ rows, int width, int height, int spacing) {
     const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
     if (x >= width || y >= height) return;
-    const size_t pixels = size_t(width) * height, at = size_t(y) * width + x;
+    const size_t pixels = size_t(width) * height, row = size_t(y) * width;
+    const Taps along = taps(x, width, spacing, 1);
     RW_UNROLL
-    for (int k = 0; k < 8; ++k) rows[k * pixels + at] = b3(fine.planes[k / 4][k % 4], width, height, x, y, spacing, true);
+    for (int k = 0; k < 8; ++k) rows[k * pixels + row + x] = b3(fine.planes[k / 4][k % 4] + row, along);
 }
 
 // Blocks of 32 x 8 pixels.

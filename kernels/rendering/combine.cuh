@@ -23,16 +23,23 @@ struct Quarters {
 };
 static_assert(sizeof(Quarters) == 64, "layout");
 
-// B3 filter at (x, y) of a plane, along the rows or the columns.
-RW_FN float b3(const float* plane, int width, int height, int x, int y, int spacing, bool along_rows) {
+// Offsets of the five nodes of a B3 filter at a position of 0..count, `stride` apart in memory. Those of a pixel are the same in all planes.
+struct Taps {
+    int at[5];
+};
+
+RW_FN Taps taps(int position, int count, int spacing, int stride) {
+    Taps taps;
+    RW_UNROLL
+    for (int i = 0; i < 5; ++i) taps.at[i] = reflected(position + (i - 2) * spacing, count) * stride;
+    return taps;
+}
+
+RW_FN float b3(const float* line, const Taps& taps) {
     const float kernel[5] = {0.0625f, 0.25f, 0.375f, 0.25f, 0.0625f};
     float sum = 0.0f;
     RW_UNROLL
-    for (int i = 0; i < 5; ++i) {
-        const int apart = (i - 2) * spacing;
-        const int at = along_rows ? y * width + reflected(x + apart, width) : reflected(y + apart, height) * width + x;
-        sum += kernel[i] * plane[at];
-    }
+    for (int i = 0; i < 5; ++i) sum += kernel[i] * line[taps.at[i]];
     return sum;
 }
 
@@ -65,13 +72,14 @@ RW_FN void put_details(const Level& level, int at, const float (&details)[2][3],
 RW_FN void split_level(const Quarters& fine, const float* rows, float* coarse, const Level& level, int x, int y, int spacing) {
     const size_t pixels = size_t(level.width) * level.height;
     const int at = y * level.width + x;
+    const Taps column = taps(y, level.height, spacing, level.width);
     float details[2][3], weights[2];
     RW_UNROLL
     for (int q = 0; q < 2; ++q) {
         float smooth[4], own[4];
         RW_UNROLL
         for (int k = 0; k < 4; ++k) {
-            smooth[k] = b3(rows + (4 * q + k) * pixels, level.width, level.height, x, y, spacing, false);
+            smooth[k] = b3(rows + (4 * q + k) * pixels + x, column);
             own[k] = fine.planes[q][k][at];
         }
         RW_UNROLL
@@ -100,30 +108,74 @@ RW_FN float gain_of(float signal, float energy) {
 }
 
 constexpr int BOX_RADIUS = 32;  // largest radius; radii are powers of two
-constexpr int BOX_ROW = 512;    // pixels of a row that one block sums
+constexpr int BOX_ROW = 1024;   // pixels of a row that one block sums
 constexpr int BOX_LINES = 16, BOX_COLUMN = 128;  // columns and rows that one block sums
-constexpr int BOX_ROW_MEMORY = 3 * (BOX_ROW + 2 * BOX_RADIUS);
-constexpr int BOX_COLUMN_MEMORY = (3 * (BOX_COLUMN + 2 * BOX_RADIUS) + BOX_COLUMN) * BOX_LINES;
+constexpr int BOX_GROUP = 8;    // sums of a thread at a time
+// Places of a line in shared memory. One is left out after every eight, so that threads that are eight apart meet in no bank.
+RW_FN constexpr int box_place(int position) { return position + position / BOX_GROUP; }
+constexpr int BOX_ROW_PLACES = box_place(BOX_ROW + 2 * BOX_RADIUS + 2 * BOX_GROUP);
+constexpr int BOX_COLUMN_PLACES = box_place(BOX_COLUMN + 2 * BOX_RADIUS + 2 * BOX_GROUP);
+constexpr int BOX_ROW_MEMORY = 2 * BOX_ROW_PLACES, BOX_COLUMN_MEMORY = (2 * BOX_COLUMN_PLACES + BOX_COLUMN) * BOX_LINES;
+static_assert(BOX_ROW % (BOX_GROUP * BOX_GROUP) == 0 && BOX_COLUMN % (BOX_GROUP * BOX_GROUP) == 0, "whole groups of groups");
 
-// Sums of 2 radius + 1 neighbours along LINES parallel lines, `count` each. Pairs, pairs of pairs and so on are summed, which takes few steps and
-// keeps small sums exact beside large ones. load(line, position): positions from -radius on. keep(line, position, sum). memory: 3 * LINES *
-// (count + 2 * radius) floats.
-template <int LINES, class Load, class Keep> RW_FN void box_lines(const Block& block, int count, int radius, float* memory, Load load, Keep keep) {
-    const int length = count + 2 * radius, size = length * LINES;
-    const float* from = memory;
-    block.each(size, [&](int i) { memory[i] = load(i % LINES, i / LINES - radius); });
-    for (int summed = 1; summed < 2 * radius; summed *= 2) {
-        float* to = memory + (from == memory + size ? 2 * size : size);
-        block.each((length - 2 * summed + 1) * LINES, [&](int i) { to[i] = from[i] + from[i + summed * LINES]; });
-        from = to;
+// Sums of 2^DOUBLINGS values each, `apart` apart, at BOX_GROUP positions that are as far apart. value(k): the k-th value.
+template <int DOUBLINGS, class Value> RW_FN void doubled(Value value, float (&sums)[BOX_GROUP]) {
+    float values[BOX_GROUP + (1 << DOUBLINGS) - 1];
+    RW_UNROLL
+    for (int k = 0; k < BOX_GROUP + (1 << DOUBLINGS) - 1; ++k) values[k] = value(k);
+    RW_UNROLL
+    for (int summed = 1; summed < 1 << DOUBLINGS; summed *= 2) {
+        RW_UNROLL
+        for (int k = 0; k < BOX_GROUP + (1 << DOUBLINGS) - 1 - summed; ++k) values[k] += values[k + summed];
     }
-    block.each(count * LINES, [&](int i) { keep(i % LINES, i / LINES, from[i] + memory[i + 2 * radius * LINES]); });
+    RW_UNROLL
+    for (int k = 0; k < BOX_GROUP; ++k) sums[k] = values[k];
+}
+
+template <class Value> RW_FN void doubled(int doublings, Value value, float (&sums)[BOX_GROUP]) {
+    if (doublings == 3) doubled<3>(value, sums);
+    else if (doublings == 2) doubled<2>(value, sums);
+    else if (doublings == 1) doubled<1>(value, sums);
+    else doubled<0>(value, sums);
+}
+
+// Sums of 2 radius + 1 neighbours along LINES parallel lines, `count` each, a multiple of 64. Pairs, pairs of pairs and so on are summed, which takes few
+// steps and keeps small sums exact beside large ones: up to 8 neighbours at once, then up to 8 of their sums. load(line, position): positions from -radius
+// on. keep(line, position, sum). memory: 2 * LINES * PLACES floats.
+template <int LINES, int PLACES, class Load, class Keep>
+RW_FN void box_lines(const Block& block, int count, int radius, float* memory, Load load, Keep keep) {
+    float* eights = memory + PLACES * LINES;
+    const int length = count + 2 * radius;
+    int first = 0, then = 0;
+    for (int summed = 1; summed < 2 * radius; summed *= 2) first < 3 ? ++first : ++then;
+    block.each((length + 2 * BOX_GROUP) * LINES, [&](int i) {
+        const int position = i / LINES;
+        memory[box_place(position) * LINES + i % LINES] = position < length ? load(i % LINES, position - radius) : 0.0f;
+    });
+    block.each((length + BOX_GROUP) / BOX_GROUP * LINES, [&](int i) {
+        const int line = i % LINES, begin = i / LINES * BOX_GROUP;
+        float sums[BOX_GROUP];
+        doubled(first, [&](int k) { return memory[box_place(begin + k) * LINES + line]; }, sums);
+        RW_UNROLL
+        for (int k = 0; k < BOX_GROUP; ++k) eights[box_place(begin + k) * LINES + line] = sums[k];
+    });
+    block.each(count / BOX_GROUP * LINES, [&](int i) {
+        const int line = i % LINES, group = i / LINES;
+        const int begin = group / BOX_GROUP * (BOX_GROUP * BOX_GROUP) + group % BOX_GROUP;
+        float sums[BOX_GROUP];
+        doubled(then, [&](int k) { return eights[box_place(begin + BOX_GROUP * k) * LINES + line]; }, sums);
+        RW_UNROLL
+        for (int k = 0; k < BOX_GROUP; ++k) {
+            const int position = begin + BOX_GROUP * k;
+            keep(line, position, sums[k] + memory[box_place(position + 2 * radius) * LINES + line]);
+        }
+    });
 }
 
 // Sums of `from` along row y, for pixels from x on.
 RW_FN void box_row(const Block& block, const float* from, float* to, int width, int x, int y, int radius, float* memory) {
     const size_t row = size_t(y) * width;
-    box_lines<1>(
+    box_lines<1, BOX_ROW_PLACES>(
         block, BOX_ROW, radius, memory,
         [&](int, int i) { return x + i >= 0 && x + i < width ? from[row + x + i] : 0.0f; },
         [&](int, int i, float sum) {
@@ -135,14 +187,14 @@ RW_FN void box_row(const Block& block, const float* from, float* to, int width, 
 template <class Use>
 RW_FN void box_columns(const Block& block, const float* from, int width, int height, int x, int y, int radius, float* memory, Use use) {
     const float* second = from + size_t(width) * height;
-    float* first_sums = memory + 3 * (BOX_COLUMN + 2 * BOX_RADIUS) * BOX_LINES;
+    float* first_sums = memory + 2 * BOX_COLUMN_PLACES * BOX_LINES;
     auto load = [&](const float* plane, int line, int i) {
         return x + line < width && y + i >= 0 && y + i < height ? plane[size_t(y + i) * width + x + line] : 0.0f;
     };
-    box_lines<BOX_LINES>(
+    box_lines<BOX_LINES, BOX_COLUMN_PLACES>(
         block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(from, line, i); },
         [&](int line, int i, float sum) { first_sums[i * BOX_LINES + line] = sum; });
-    box_lines<BOX_LINES>(
+    box_lines<BOX_LINES, BOX_COLUMN_PLACES>(
         block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(second, line, i); },
         [&](int line, int i, float sum) {
             if (x + line < width && y + i < height) use(size_t(y + i) * width + x + line, first_sums[i * BOX_LINES + line], sum);

@@ -10,8 +10,10 @@ constexpr int FEATURES = 4;
 constexpr int MATRIX_SUMS = FEATURES * (FEATURES + 1) / 2, NORMAL_SUMS = MATRIX_SUMS + 2 * FEATURES + 1;
 constexpr double RIDGE = 1e-6, FEW = 10.0;
 // Pixels that a block sums at a time, floats of one of them (features and both halves' sums by channel, pairs), and threads of a sum.
-constexpr int STRIP = 256, STRIP_FIELDS = 3 * (FEATURES + 2) + 1, STRIP_PARTS = 4;
+constexpr int STRIP = 256, STRIP_FIELDS = 3 * (FEATURES + 2) + 1, STRIP_PARTS = 12;
 constexpr int STRIP_MEMORY = STRIP * STRIP_FIELDS + NORMAL_SUMS * STRIP_PARTS;
+// Threads that sum a field of all blocks.
+constexpr int SOLVE_PARTS = 13, SOLVE_MEMORY = NORMAL_SUMS * (1 + SOLVE_PARTS);
 
 struct Regression {
     const float* sums;     // planes of the sums over pairs
@@ -39,12 +41,11 @@ RW_FN void put_guides(const Regression& r, size_t at) {
 RW_FN void filter_guides(const float* from, float* to, int width, int height, int x, int y, int spacing) {
     const float kernel[5] = {0.0625f, 0.25f, 0.375f, 0.25f, 0.0625f};
     const size_t pixels = size_t(width) * height;
+    const Taps row = taps(x, width, spacing, 1), column = taps(y, height, spacing, width);
     for (int k = 0; k < GUIDES; ++k) {
         float sum = 0.0f;
         RW_UNROLL
-        for (int i = 0; i < 5; ++i) {
-            sum += kernel[i] * b3(from + k * pixels, width, height, x, reflected(y + (i - 2) * spacing, height), spacing, true);
-        }
+        for (int i = 0; i < 5; ++i) sum += kernel[i] * b3(from + k * pixels + column.at[i], row);
         to[k * pixels + size_t(y) * width + x] = sum;
     }
 }
@@ -119,11 +120,17 @@ RW_FN void sum_normal(const Block& block, const Regression& r, int number, float
     });
 }
 
-// Solves the normal equations of both halves by Cholesky factors. memory: NORMAL_SUMS doubles.
+// Solves the normal equations of both halves by Cholesky factors. memory: SOLVE_MEMORY doubles.
 RW_FN void solve_normal(const Block& block, const Regression& r, double* memory) {
+    double* parts = memory + NORMAL_SUMS;
+    block.each(NORMAL_SUMS * SOLVE_PARTS, [&](int i) {
+        double sum = 0.0;
+        for (int number = i / NORMAL_SUMS; number < r.blocks; number += SOLVE_PARTS) sum += r.partial[size_t(number) * NORMAL_SUMS + i % NORMAL_SUMS];
+        parts[i] = sum;
+    });
     block.each(NORMAL_SUMS, [&](int field) {
         double sum = 0.0;
-        for (int number = 0; number < r.blocks; ++number) sum += r.partial[size_t(number) * NORMAL_SUMS + field];
+        for (int part = 0; part < SOLVE_PARTS; ++part) sum += parts[part * NORMAL_SUMS + field];
         memory[field] = sum;
     });
     block.each(1, [&](int) {

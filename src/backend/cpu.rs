@@ -211,10 +211,12 @@ fn refine_on_cpu(
         report(1.0);
     }
     Ok(match refined {
-        Some((film, stats, error)) => Rendered { film, stats, tally, samples, error: Some(error).filter(PictureError::is_known) },
+        Some((film, stats, error)) => {
+            Rendered { film: film.into(), stats, tally, samples, error: Some(error).filter(PictureError::is_known) }
+        }
         None => {
             let (film, stats) = stopped(renderer);
-            Rendered { film, stats, tally, samples, error: None }
+            Rendered { film: film.into(), stats, tally, samples, error: None }
         }
     })
 }
@@ -270,7 +272,7 @@ fn refine_map(frame: &HostFrame<'_>, renderer: &Renderer, picture: &mut HostPict
             (film, stats, None)
         }
     };
-    Ok(Rendered { film, stats, tally: seeds.tally, samples: Samples::default(), error })
+    Ok(Rendered { film: film.into(), stats, tally: seeds.tally, samples: Samples::default(), error })
 }
 
 /// What is left of a frame that was stopped.
@@ -297,7 +299,7 @@ pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer, picture: &m
         .render(frame.picture, &mut router, frame.samples.ceil() as usize, frame.progress.map(|report| report as &dyn Fn(f32)), frame.stop)
         .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
     let (tally, samples) = router.finish()?;
-    Ok(Rendered { film, stats, tally, samples, error: None })
+    Ok(Rendered { film: film.into(), stats, tally, samples, error: None })
 }
 
 impl Surrogate for HostSurrogate {

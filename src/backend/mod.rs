@@ -37,6 +37,7 @@ use ridgewatch_surrogate::{
     SurrogateSettings, Trace,
 };
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use thiserror::Error;
 
@@ -236,7 +237,7 @@ pub struct Smooth {
 /// A rendered frame.
 pub struct Rendered<S> {
     /// The picture.
-    pub film: Film,
+    pub film: Arc<Film>,
     /// Counts and times of the renderer.
     pub stats: RenderStats,
     /// Counts and times of the query router.

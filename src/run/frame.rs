@@ -141,7 +141,7 @@ impl Run<'_> {
         self.progress.pictures += u64::from(!place.is_warmup);
         Ok(Frame {
             record: Arc::new(record),
-            film: Arc::new(work.rendered.film),
+            film: work.rendered.film,
             tone_map: scene.render.tone_map_of(method),
             color_bar: Some(Arc::clone(&self.color_bar)),
             gate: frozen.is_some().then(|| Arc::new(gate)),

@@ -159,7 +159,7 @@ int main(int, char** arguments) {
         };
         const int blocks = 3;
         std::vector<float> guides(GUIDES * pixels, NAN), around(GUIDES * pixels, NAN), scratch(GUIDES * pixels, NAN), strip(STRIP_MEMORY, NAN);
-        std::vector<double> partial(NORMAL_SUMS * blocks, NAN), coefficients(2 * FEATURES, NAN), normal(NORMAL_SUMS, NAN);
+        std::vector<double> partial(NORMAL_SUMS * blocks, NAN), coefficients(2 * FEATURES, NAN), normal(SOLVE_MEMORY, NAN);
         const Regression regression = {sums.data(),    base.data(),         guides.data(), around.data(), scratch.data(),
                                        partial.data(), coefficients.data(), c.per_ray,     width,         height,         blocks, 0};
         for (size_t at = 0; at < pixels; ++at) put_guides(regression, at);
@@ -189,7 +189,7 @@ int main(int, char** arguments) {
                     for (int y = 0; y < height; ++y) {
                         for (int x = 0; x < width; ++x) {
                             for (int k = 0; k < 8; ++k) {
-                                rows[k * pixels + y * width + x] = b3(fine.planes[k / 4][k % 4], width, height, x, y, spacing, true);
+                                rows[k * pixels + y * width + x] = b3(fine.planes[k / 4][k % 4] + y * width, taps(x, width, spacing, 1));
                             }
                         }
                     }

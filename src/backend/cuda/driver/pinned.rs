@@ -3,6 +3,7 @@
 use crate::cuda::DeviceError;
 use crate::cuda::driver_error;
 use cudarc::driver::{CudaContext, CudaStream, result};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Pinned values. The device may write them at any time between [`Self::copy_from`] and the next synchronisation of its stream, so a caller
@@ -51,8 +52,23 @@ impl<T: Copy + Default> Pinned<T> {
     /// # Safety
     /// The address `from` holds `count` values when the stream executes the copy.
     pub(in crate::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
+        // SAFETY: guaranteed by the caller.
+        unsafe { self.copy_behind(stream, from, 0..count) }
+    }
+
+    /// As [`Self::copy_from`], to a range of this memory.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// The range ends behind [`Self::len`].
+    ///
+    /// # Safety
+    /// The address `from` holds as many values when the stream executes the copy.
+    pub(in crate::cuda) unsafe fn copy_behind(&mut self, stream: &CudaStream, from: u64, range: Range<usize>) -> Result<(), DeviceError> {
         // SAFETY: the allocation has `len` values, and `&mut self` is the only access to them.
-        let to = unsafe { front(self.values, self.len, count) };
+        let to = unsafe { &mut front(self.values, self.len, range.end)[range.start..] };
         // SAFETY: guaranteed by the caller; the host memory lives until `drop`, where the driver waits for copies in progress.
         unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(driver_error("copying from the device"))
     }

@@ -7,8 +7,8 @@ use super::coupled::SUM_PLANES;
 use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
 use crate::cuda::driver::pinned::Pinned;
 use crate::cuda::layout::device_repr;
-use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
-use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
+use crate::cuda::{Buffer, DeviceError, Gpu, driver_error, launch, threads};
+use cudarc::driver::{CudaEvent, CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_render::Combine as Combination;
 use ridgewatch_render::smooth::{TILE, TileSums};
 use std::sync::Arc;
@@ -18,12 +18,13 @@ const LEVELS: u32 = 5;
 /// Radius over which energies are summed, and the largest one that the kernels can sum, in pixels.
 const RADIUS: i32 = 32;
 /// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
-const BOX_ROW: usize = 512;
+const BOX_ROW: usize = 1024;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
 /// First plane of the pairs by quarter in the sums (see [`SUM_PLANES`]).
 const PAIR_COUNTS: usize = 12;
-/// Floats of a pixel of the film.
+/// Floats of a pixel of the film, and of them those that are complete before the error.
 const FILM_PLANES: usize = 8;
+const SHOWN_PLANES: usize = 5;
 /// Of `regression.cuh`: features, sums of the normal equations.
 const FEATURES: usize = 4;
 const NORMAL_SUMS: usize = FEATURES * (FEATURES + 1) / 2 + 2 * FEATURES + 1;
@@ -112,18 +113,56 @@ pub struct CombineInput<'a> {
     pub lit: f32,
 }
 
-/// A finished film in pinned memory; one value a pixel, rows from the top.
+/// A finished film on its way to pinned memory; one value a pixel, rows from the top.
 pub struct FilmPlanes<'a> {
+    pinned: &'a Pinned<f32>,
+    pixels: usize,
+    arrivals: [&'a CudaEvent; 2],
+}
+
+/// The planes that are complete before the error.
+pub struct ShownPlanes<'a> {
     /// Linear radiance and alpha.
     pub rgba: &'a [[f32; 4]],
     /// Mean FTLE; NaN where alpha is 0.
     pub ftle_mean: &'a [f32],
+}
+
+/// The other planes.
+pub struct MeasuredPlanes<'a> {
     /// Stated error of the radiance; see [`GpuCombine::finish`].
     pub error: &'a [f32],
     /// Share seen through missing cells.
     pub missing: &'a [f32],
     /// Samples, two a pair.
     pub samples: &'a [f32],
+}
+
+impl<'a> FilmPlanes<'a> {
+    /// Waits for the first planes.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub fn shown(&self) -> Result<ShownPlanes<'a>, DeviceError> {
+        wait(self.arrivals[0])?;
+        let (rgba, rest) = self.pinned.values().split_at(4 * self.pixels);
+        Ok(ShownPlanes { rgba: bytemuck::cast_slice(rgba), ftle_mean: &rest[..self.pixels] })
+    }
+
+    /// Waits for the other planes.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub fn measured(&self) -> Result<MeasuredPlanes<'a>, DeviceError> {
+        wait(self.arrivals[1])?;
+        let plane = |number: usize| &self.pinned.values()[number * self.pixels..(number + 1) * self.pixels];
+        Ok(MeasuredPlanes { error: plane(5), missing: plane(6), samples: plane(7) })
+    }
+}
+
+/// Waits for the work before an event.
+fn wait(event: &CudaEvent) -> Result<(), DeviceError> {
+    event.synchronize().map_err(driver_error("waiting for a picture"))
 }
 
 /// Offsets of the planes of the working memory. The film overwrites planes that only the shrinkage needs.
@@ -181,8 +220,10 @@ pub struct GpuCombine {
     tile_sums: Option<Buffer<f32>>,
     tiles_read: Option<Pinned<f32>>,
     film_read: Option<Pinned<f32>>,
-    /// Argument of the picture that [`Self::finish`] completes.
-    begun: Option<CombineArgument>,
+    /// Argument of the picture that [`Self::finish`] completes, and the arrival of its first planes.
+    begun: Option<(CombineArgument, CudaEvent)>,
+    /// Arrivals of the planes of a finished film.
+    arrivals: Option<[CudaEvent; 2]>,
 }
 
 impl GpuCombine {
@@ -212,6 +253,7 @@ impl GpuCombine {
             tiles_read: None,
             film_read: None,
             begun: None,
+            arrivals: None,
         })
     }
 
@@ -224,7 +266,7 @@ impl GpuCombine {
     }
 
     /// Adds the correction to the picture, and returns the sums of each tile, rows of tiles from the top. Waits for them. The film is then complete
-    /// but for its error.
+    /// but for its error, and on its way to the host.
     ///
     /// # Errors
     /// The picture has no rays or another size, or the device fails or lacks memory.
@@ -292,8 +334,12 @@ impl GpuCombine {
         let read = pinned_room(&gpu, &mut self.tiles_read, count)?;
         // SAFETY: `tile_sums` holds `count` values.
         unsafe { read.copy_from(gpu.work(), tile_sums, count) }?;
-        gpu.synchronize()?;
-        self.begun = Some(argument);
+        let has_tiles = gpu.mark()?;
+        let film = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
+        // SAFETY: the planes hold the film.
+        unsafe { film.copy_from(gpu.work(), argument.film, SHOWN_PLANES * pixels) }?;
+        self.begun = Some((argument, gpu.mark()?));
+        wait(&has_tiles)?;
         Ok(bytemuck::cast_slice(&read.values()[..count]))
     }
 
@@ -378,7 +424,7 @@ impl GpuCombine {
         unsafe { launch(call.arg(&from).arg(&to).arg(&across).arg(&down).arg(&radius), config) }
     }
 
-    /// Completes the film of the latest [`Self::combine`] and copies it to the host. The error of a pixel is the root of the mean squared error over
+    /// Completes the film of the latest [`Self::combine`], on its way to the host. The error of a pixel is the root of the mean squared error over
     /// a square of `radius` pixels (a power of two, at most 32), which is at least `floor`, plus `added`.
     ///
     /// # Errors
@@ -388,7 +434,7 @@ impl GpuCombine {
     /// If the radius is not one of those.
     pub fn finish(&mut self, radius: u32, floor: f32, added: f32) -> Result<FilmPlanes<'_>, DeviceError> {
         assert!(radius.is_power_of_two() && radius <= RADIUS as u32, "a radius that the kernels can sum");
-        let (Some(argument), Some(planes)) = (self.begun.take(), &self.planes) else {
+        let (Some((argument, shown)), Some(planes)) = (self.begun.take(), &self.planes) else {
             return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
         };
         let size = [argument.width as usize, argument.height as usize];
@@ -402,13 +448,12 @@ impl GpuCombine {
             self.box_rows(argument.squared, boxed, size, radius)?;
             launch(&mut call, box_columns(size))?;
         }
-        let read = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
+        let pinned = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
+        let rest = SHOWN_PLANES * pixels..FILM_PLANES * pixels;
         // SAFETY: the planes hold the film.
-        unsafe { read.copy_from(gpu.work(), argument.film, FILM_PLANES * pixels) }?;
-        gpu.synchronize()?;
-        let (rgba, rest) = read.values().split_at(4 * pixels);
-        let plane = |number: usize| &rest[number * pixels..(number + 1) * pixels];
-        Ok(FilmPlanes { rgba: bytemuck::cast_slice(rgba), ftle_mean: plane(0), error: plane(1), missing: plane(2), samples: plane(3) })
+        unsafe { pinned.copy_behind(gpu.work(), planes.address_of(PLANES.film * pixels + rest.start), rest) }?;
+        let [shown, measured] = self.arrivals.insert([shown, gpu.mark()?]);
+        Ok(FilmPlanes { pinned, pixels, arrivals: [shown, measured] })
     }
 }
 

@@ -2,7 +2,7 @@
 //! result. The algorithm and its reference are in [`ridgewatch_render::smooth`]; how finely to march and where to sample is decided there as well.
 
 use super::bricks::{DeviceBricks, Wanted};
-use super::combine::{CombineInput, FilmPlanes, GpuCombine};
+use super::combine::{CombineInput, FilmPlanes, GpuCombine, MeasuredPlanes, ShownPlanes};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 use super::predictor::Predictor;
@@ -30,6 +30,8 @@ const LIGHT_SHARE: u64 = 8;
 const MIN_MARCH_SECONDS: f64 = 0.005;
 /// Pairs of a tile in one call of the tracker.
 const MAX_PAIRS: usize = 256;
+/// Films that are kept to be filled again: one on its way and some in the hands of subscribers.
+const FILMS: usize = 4;
 
 /// One picture that accumulates on the GPU. It reuses kernels and memory from picture to picture.
 pub(in crate::cuda) struct GpuSmooth {
@@ -49,6 +51,9 @@ pub(in crate::cuda) struct GpuSmooth {
     control: MarchControl,
     allocation: Allocation,
     pairs: u64,
+    /// The latest films. Those that nobody holds any more are filled again, since new memory is mapped page by page at the first write, which takes
+    /// longer than the copy.
+    films: Vec<Arc<Film>>,
 }
 
 /// One round of refinement.
@@ -98,6 +103,7 @@ impl GpuSmooth {
             control: MarchControl::default(),
             allocation: Allocation::default(),
             pairs: 0,
+            films: Vec::new(),
         })
     }
 
@@ -161,7 +167,7 @@ impl GpuSmooth {
         round: &SmoothRound<'_>,
         renderer: &mut Renderer,
         answers: &mut dyn DeviceLogStretch,
-    ) -> Result<Option<(Film, RenderStats, PictureError)>, DeviceError> {
+    ) -> Result<Option<(Arc<Film>, RenderStats, PictureError)>, DeviceError> {
         self.settle(round, renderer, answers)?;
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
@@ -201,9 +207,27 @@ impl GpuSmooth {
         };
         let march = self.control.error();
         let floor = if error.is_known() { ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0) } else { 0.0 };
-        let film = film(&self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?, width, height);
+        let mut film = self.spare_film(width, height);
+        let planes = self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?;
+        match Arc::get_mut(&mut film) {
+            Some(film) => fill(film, &planes)?,
+            None => return Err(unsupported("a film that is shown already")),
+        }
+        if self.films.len() == FILMS {
+            self.films.remove(0);
+        }
+        self.films.push(film.clone());
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
         Ok(Some((film, stats, error)))
+    }
+
+    /// A film of this size that nobody else holds.
+    fn spare_film(&mut self, width: usize, height: usize) -> Arc<Film> {
+        let is_spare = |film: &Arc<Film>| Arc::strong_count(film) == 1 && (film.width, film.height) == (width, height);
+        match self.films.iter().position(is_spare) {
+            Some(spare) => self.films.swap_remove(spare),
+            None => Arc::new(Film { width, height, ..Film::default() }),
+        }
     }
 
     /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
@@ -320,23 +344,21 @@ fn medium<'a>(nodes: &'a DeviceNodes, round: &SmoothRound<'a>, parameters: &'a F
     Ok(Medium { parameters, nodes: node_grid(nodes, round)?, missing_cells: round.tracer.missing_cells() })
 }
 
-/// Copies the planes, with all threads.
-fn film(planes: &FilmPlanes<'_>, width: usize, height: usize) -> Film {
+/// Copies the planes as they arrive, with all threads.
+fn fill(film: &mut Film, planes: &FilmPlanes<'_>) -> Result<(), DeviceError> {
     use rayon::prelude::*;
     const CHUNK: usize = 1 << 16;
-    fn copied(from: &[f32]) -> Vec<f32> {
-        from.par_iter().with_min_len(CHUNK).copied().collect()
+    fn put<T: Copy + Default + Send + Sync, F: Copy + Sync>(to: &mut Vec<T>, from: &[F], value: impl Fn(F) -> T + Sync) {
+        to.resize(from.len(), T::default());
+        to.par_iter_mut().zip(from).with_min_len(CHUNK).for_each(|(to, from)| *to = value(*from));
     }
-    let traced = |samples: &f32| if *samples > 0.0 { 1.0 } else { 0.0 };
-    Film {
-        width,
-        height,
-        rgba: planes.rgba.par_iter().with_min_len(CHUNK).copied().collect(),
-        ftle_mean: copied(planes.ftle_mean),
-        traced: planes.samples.par_iter().with_min_len(CHUNK).map(traced).collect(),
-        missing: copied(planes.missing),
-        samples: copied(planes.samples),
-        error: copied(planes.error),
-        ..Film::default()
-    }
+    let ShownPlanes { rgba, ftle_mean } = planes.shown()?;
+    put(&mut film.rgba, rgba, |v| v);
+    put(&mut film.ftle_mean, ftle_mean, |v| v);
+    let MeasuredPlanes { error, missing, samples } = planes.measured()?;
+    put(&mut film.error, error, |v| v);
+    put(&mut film.missing, missing, |v| v);
+    put(&mut film.samples, samples, |v| v);
+    put(&mut film.traced, samples, |samples| if samples > 0.0 { 1.0 } else { 0.0 });
+    Ok(())
 }
