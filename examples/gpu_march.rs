@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::backend::cuda::{
-    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, RayCheck,
+    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, PinnedFilm, RayCheck,
     SnapshotStore, Tuning,
 };
 use ridgewatch::field::Window;
@@ -106,7 +106,7 @@ fn main() {
     println!("\n| correction | combination | error and film |");
     println!("|---|---|---|");
     for (name, how) in [("left out", None), ("shrunk", Some(Combine::Shrink)), ("summed", Some(Combine::Sum))] {
-        let mut finished = f32::INFINITY;
+        let (mut finished, mut film) = (f32::INFINITY, PinnedFilm::new(&gpu, width, height));
         let combined = median(&gpu, || {
             let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             combine.combine(&input).map(drop)
@@ -115,7 +115,7 @@ fn main() {
             let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             combine.combine(&input).unwrap();
             let began = gpu.mark().unwrap();
-            combine.finish(8, 1e-4, 1e-5).unwrap().measured().unwrap();
+            combine.finish(8, 1e-4, 1e-5, &mut film, false).unwrap();
             finished = finished.min(gpu.milliseconds(&began, &gpu.mark().unwrap()).unwrap());
         }
         println!("| {name} | {combined:.3} | {finished:.3} |");

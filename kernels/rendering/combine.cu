@@ -68,7 +68,7 @@ combine_box(const float* __restrict__ from, float* __restrict__ to, int width, i
 }
 
 // Blocks of BOX_LINES x BOX_COLUMN pixels.
-extern "C" __global__ void __launch_bounds__(256)
+extern "C" __global__ void __launch_bounds__(256, 4)
 combine_gains(const Level level, const float* __restrict__ sums, int radius, float* __restrict__ half) {
     __shared__ float memory[BOX_COLUMN_MEMORY];
     add_level(Block{}, level, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, half, memory);

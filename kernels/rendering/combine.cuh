@@ -118,16 +118,20 @@ constexpr int BOX_COLUMN_PLACES = box_place(BOX_COLUMN + 2 * BOX_RADIUS + 2 * BO
 constexpr int BOX_ROW_MEMORY = 2 * BOX_ROW_PLACES, BOX_COLUMN_MEMORY = (2 * BOX_COLUMN_PLACES + BOX_COLUMN) * BOX_LINES;
 static_assert(BOX_ROW % (BOX_GROUP * BOX_GROUP) == 0 && BOX_COLUMN % (BOX_GROUP * BOX_GROUP) == 0, "whole groups of groups");
 
+// Adds to each value the one that is APART behind it, as far as there is one.
+template <int APART, int COUNT> RW_FN void add_behind(float (&values)[COUNT]) {
+    RW_UNROLL
+    for (int k = 0; k < COUNT - APART; ++k) values[k] += values[k + APART];
+}
+
 // Sums of 2^DOUBLINGS values each, `apart` apart, at BOX_GROUP positions that are as far apart. value(k): the k-th value.
 template <int DOUBLINGS, class Value> RW_FN void doubled(Value value, float (&sums)[BOX_GROUP]) {
     float values[BOX_GROUP + (1 << DOUBLINGS) - 1];
     RW_UNROLL
     for (int k = 0; k < BOX_GROUP + (1 << DOUBLINGS) - 1; ++k) values[k] = value(k);
-    RW_UNROLL
-    for (int summed = 1; summed < 1 << DOUBLINGS; summed *= 2) {
-        RW_UNROLL
-        for (int k = 0; k < BOX_GROUP + (1 << DOUBLINGS) - 1 - summed; ++k) values[k] += values[k + summed];
-    }
+    if (DOUBLINGS > 0) add_behind<1>(values);
+    if (DOUBLINGS > 1) add_behind<2>(values);
+    if (DOUBLINGS > 2) add_behind<4>(values);
     RW_UNROLL
     for (int k = 0; k < BOX_GROUP; ++k) sums[k] = values[k];
 }
@@ -141,7 +145,7 @@ template <class Value> RW_FN void doubled(int doublings, Value value, float (&su
 
 // Sums of 2 radius + 1 neighbours along LINES parallel lines, `count` each, a multiple of 64. Pairs, pairs of pairs and so on are summed, which takes few
 // steps and keeps small sums exact beside large ones: up to 8 neighbours at once, then up to 8 of their sums. load(line, position): positions from -radius
-// on. keep(line, position, sum). memory: 2 * LINES * PLACES floats.
+// on. keep(line, position, sums): BOX_GROUP sums, the first at this position, each BOX_GROUP behind the last. memory: 2 * LINES * PLACES floats.
 template <int LINES, int PLACES, class Load, class Keep>
 RW_FN void box_lines(const Block& block, int count, int radius, float* memory, Load load, Keep keep) {
     float* eights = memory + PLACES * LINES;
@@ -165,10 +169,8 @@ RW_FN void box_lines(const Block& block, int count, int radius, float* memory, L
         float sums[BOX_GROUP];
         doubled(then, [&](int k) { return eights[box_place(begin + BOX_GROUP * k) * LINES + line]; }, sums);
         RW_UNROLL
-        for (int k = 0; k < BOX_GROUP; ++k) {
-            const int position = begin + BOX_GROUP * k;
-            keep(line, position, sums[k] + memory[box_place(position + 2 * radius) * LINES + line]);
-        }
+        for (int k = 0; k < BOX_GROUP; ++k) sums[k] += memory[box_place(begin + BOX_GROUP * k + 2 * radius) * LINES + line];
+        keep(line, begin, sums);
     });
 }
 
@@ -178,12 +180,17 @@ RW_FN void box_row(const Block& block, const float* from, float* to, int width, 
     box_lines<1, BOX_ROW_PLACES>(
         block, BOX_ROW, radius, memory,
         [&](int, int i) { return x + i >= 0 && x + i < width ? from[row + x + i] : 0.0f; },
-        [&](int, int i, float sum) {
-            if (x + i < width) to[row + x + i] = sum;
+        [&](int, int first, const float (&sums)[BOX_GROUP]) {
+            RW_UNROLL
+            for (int k = 0; k < BOX_GROUP; ++k) {
+                const int i = first + BOX_GROUP * k;
+                if (x + i < width) to[row + x + i] = sums[k];
+            }
         });
 }
 
-// Sums of two planes along columns, for a block of pixels with its corner at (x, y). use(pixel, sum of the first plane, of the second).
+// Sums of two planes along columns, for a block of pixels with its corner at (x, y). use(pixels, sums of the first plane, of the second): BOX_GROUP
+// pixels, those outside of the picture -1.
 template <class Use>
 RW_FN void box_columns(const Block& block, const float* from, int width, int height, int x, int y, int radius, float* memory, Use use) {
     const float* second = from + size_t(width) * height;
@@ -193,20 +200,43 @@ RW_FN void box_columns(const Block& block, const float* from, int width, int hei
     };
     box_lines<BOX_LINES, BOX_COLUMN_PLACES>(
         block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(from, line, i); },
-        [&](int line, int i, float sum) { first_sums[i * BOX_LINES + line] = sum; });
+        [&](int line, int first, const float (&sums)[BOX_GROUP]) {
+            RW_UNROLL
+            for (int k = 0; k < BOX_GROUP; ++k) first_sums[(first + BOX_GROUP * k) * BOX_LINES + line] = sums[k];
+        });
     box_lines<BOX_LINES, BOX_COLUMN_PLACES>(
         block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(second, line, i); },
-        [&](int line, int i, float sum) {
-            if (x + line < width && y + i < height) use(size_t(y + i) * width + x + line, first_sums[i * BOX_LINES + line], sum);
+        [&](int line, int first, const float (&sums)[BOX_GROUP]) {
+            float others[BOX_GROUP];
+            int pixels[BOX_GROUP];
+            RW_UNROLL
+            for (int k = 0; k < BOX_GROUP; ++k) {
+                const int i = first + BOX_GROUP * k;
+                others[k] = first_sums[i * BOX_LINES + line];
+                pixels[k] = x + line < width && y + i < height ? (y + i) * width + x + line : -1;
+            }
+            use(pixels, others, sums);
         });
 }
 
 // Adds a level, times its gains, to the shrunk correction of a half (3 planes). `sums`: energies summed along rows.
 RW_FN void add_level(const Block& block, const Level& level, const float* sums, int x, int y, int radius, float* half, float* memory) {
     const size_t pixels = size_t(level.width) * level.height;
-    box_columns(block, sums, level.width, level.height, x, y, radius, memory, [&](size_t at, float signal, float energy) {
-        const float gain = gain_of(signal, energy);
-        for (int k = 0; k < 3; ++k) half[k * pixels + at] += gain * level.mean[k * pixels + at];
+    using Sums = const float (&)[BOX_GROUP];
+    box_columns(block, sums, level.width, level.height, x, y, radius, memory, [&](const int (&at)[BOX_GROUP], Sums signals, Sums energies) {
+        for (int k = 0; k < 3; ++k) {
+            // All reads before the first write, which they need not wait for.
+            float means[BOX_GROUP], shrunk[BOX_GROUP];
+            RW_UNROLL
+            for (int n = 0; n < BOX_GROUP; ++n) {
+                means[n] = at[n] < 0 ? 0.0f : level.mean[k * pixels + at[n]];
+                shrunk[n] = at[n] < 0 ? 0.0f : half[k * pixels + at[n]];
+            }
+            RW_UNROLL
+            for (int n = 0; n < BOX_GROUP; ++n) {
+                if (at[n] >= 0) half[k * pixels + at[n]] = shrunk[n] + gain_of(signals[n], energies[n]) * means[n];
+            }
+        }
     });
 }
 
@@ -220,7 +250,7 @@ struct Combine {
     const float* sums;    // planes as above
     const double* base;   // RAY_FIELDS planes of sums over rays
     const float* halves;  // shrunk corrections, 3 planes of each half
-    float* film;          // rgba of each pixel, then planes: mean FTLE, error, missing, samples
+    float* film;          // rgba of each pixel, then planes: mean FTLE, error, missing, samples, 1 where there are samples
     float* squared;       // 2 planes: squared error, mean over the channels, and 1 where it is known, otherwise 0 and 0
     float* tiles;         // TILE_FIELDS a tile, rows of tiles from the top
     double per_ray;       // 1 / rays of a pixel
@@ -288,20 +318,34 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
     const float pairs[2] = {c.sums[PAIR_COUNTS * pixels + at], c.sums[(PAIR_COUNTS + 1) * pixels + at]};
     const float all = pairs[0] + pairs[1], most = max_(all, 1.0f);
     double base[RAY_FIELDS];
+    float sums[2][2][3], shrunk[2][3];
+    // All reads at once.
+    RW_UNROLL
     for (int k = 0; k < RAY_FIELDS; ++k) base[k] = c.base[k * pixels + at];
+    RW_UNROLL
+    for (int half = 0; half < 2; ++half) {
+        RW_UNROLL
+        for (int k = 0; k < 3; ++k) {
+            RW_UNROLL
+            for (int quarter = 0; quarter < 2; ++quarter) sums[half][quarter][k] = c.sums[(6 * half + 3 * quarter + k) * pixels + at];
+            shrunk[half][k] = c.halves[(3 * half + k) * pixels + at];
+        }
+    }
     float alpha = float(base[3] * c.per_ray);
     if (c.how == SUMMED) alpha += c.sums[PAIR_ALPHA * pixels + at] / (2.0f * most);
     // Squared error, its scatter, and squared radiance; the same in tone-mapped values.
     float colour[3], found[3][3], toned[3][3], difference = 0.0f;
     const bool known = all > 0.0f, both = pairs[0] > 0.0f && pairs[1] > 0.0f, is_lit = alpha > c.lit;
     const float quarters = both ? 0.0f : (pairs[0] > 0.0f ? 1.0f : -1.0f);
+    RW_UNROLL
     for (int k = 0; k < 3; ++k) {
         Halves h;
+        RW_UNROLL
         for (int half = 0; half < 2; ++half) {
-            const float first = c.sums[(6 * half + k) * pixels + at], second = c.sums[(6 * half + 3 + k) * pixels + at];
+            const float first = sums[half][0][k], second = sums[half][1][k];
             h.mean[half] = (first + second) / most;
             h.apart[half] = 0.5f * (first / max_(pairs[0], 1.0f) - second / max_(pairs[1], 1.0f));
-            h.shrunk[half] = c.halves[(3 * half + k) * pixels + at];
+            h.shrunk[half] = shrunk[half][k];
             h.shown[half] = c.how == SUMMED ? h.mean[half] : (c.how == SHRUNK ? h.shrunk[half] : 0.0f);
         }
         const float marched = float(base[k] * c.per_ray), best = marched + 0.5f * (h.shrunk[0] + h.shrunk[1]);
@@ -319,21 +363,25 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
     planes[0] = base[3] > 0.0 ? float(base[4] / base[3]) : not_a_number();
     planes[2 * pixels] = float(base[5] * c.per_ray);
     planes[3 * pixels] = 2.0f * all;
+    planes[4 * pixels] = known ? 1.0f : 0.0f;
     c.squared[at] = known ? (found[0][0] + found[0][1] + found[0][2]) / 3.0f : 0.0f;
     c.squared[pixels + at] = known ? 1.0f : 0.0f;
     auto put = [&](int field, float value) {
         fields[field * stride] = value;
         fields[(ERROR_FIELDS + field) * stride] = is_lit ? value : 0.0f;
     };
+    RW_UNROLL
     for (int which = 0; which < 3; ++which) {
-        float sums[3] = {0.0f, 0.0f, 0.0f};
-        for (int k = 0; known && k < 3; ++k) {
+        float all_channels[3] = {0.0f, 0.0f, 0.0f};
+        RW_UNROLL
+        for (int k = 0; k < 3; ++k) {
             const float third = found[which][k] / 3.0f;
-            sums[0] += third;
-            sums[1] += third / (colour[k] * colour[k] + 0.01f);
-            sums[2] += toned[which][k] / 3.0f;
+            all_channels[0] += third;
+            all_channels[1] += third / (colour[k] * colour[k] + 0.01f);
+            all_channels[2] += toned[which][k] / 3.0f;
         }
-        for (int weighting = 0; weighting < 3; ++weighting) put(3 * which + weighting, sums[weighting]);
+        RW_UNROLL
+        for (int weighting = 0; weighting < 3; ++weighting) put(3 * which + weighting, known ? all_channels[weighting] : 0.0f);
     }
     put(9, known ? 1.0f : 0.0f);
     put(10, all);
@@ -370,10 +418,14 @@ RW_FN void finish_tile(const Block& block, const Combine& c, int column, int row
 // no pixel of the square has pairs.
 RW_FN void finish_errors(const Block& block, const Combine& c, const float* sums, int x, int y, int radius, float floor, float added, float* memory) {
     const size_t pixels = size_t(c.width) * c.height;
-    box_columns(block, sums, c.width, c.height, x, y, radius, memory, [&](size_t at, float sum, float count) {
-        // As in Rust, the larger one of NaN and a number is the number.
-        const float mean = count > 0.5f ? sum / count : not_a_number();
-        c.film[5 * pixels + at] = sqrtf(max_(mean, floor) + added);
+    using Sums = const float (&)[BOX_GROUP];
+    box_columns(block, sums, c.width, c.height, x, y, radius, memory, [&](const int (&at)[BOX_GROUP], Sums squared, Sums counts) {
+        RW_UNROLL
+        for (int n = 0; n < BOX_GROUP; ++n) {
+            // As in Rust, the larger one of NaN and a number is the number.
+            const float mean = counts[n] > 0.5f ? squared[n] / counts[n] : not_a_number();
+            if (at[n] >= 0) c.film[5 * pixels + at[n]] = sqrtf(max_(mean, floor) + added);
+        }
     });
 }
 

@@ -13,6 +13,7 @@ use crate::run::{RunError, Settings};
 use crate::surrogate::{Predict, ReplayBuffer, Samples};
 use crate::trust::Gate;
 use serde::Serialize;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -141,7 +142,7 @@ impl Training<'_> {
             let is_last = number == options.epochs || report.interrupted;
             let film =
                 if is_last || options.pictures.contains(&number) { Some(self.picture(&mut backend, &tracer, &frozen)?) } else { None };
-            epoch(&done, film.as_ref());
+            epoch(&done, film.as_deref());
             report.epochs.push(done);
             if report.interrupted {
                 break;
@@ -151,7 +152,12 @@ impl Training<'_> {
     }
 
     /// A picture in which the surrogate answers everything.
-    fn picture<B: Backend>(&self, backend: &mut B, tracer: &B::Tracer, frozen: &crate::backend::FrozenOf<B>) -> Result<Film, RunError> {
+    fn picture<B: Backend>(
+        &self,
+        backend: &mut B,
+        tracer: &B::Tracer,
+        frozen: &crate::backend::FrozenOf<B>,
+    ) -> Result<Arc<Film>, RunError> {
         let Self { settings, opened, stop, .. } = self;
         let domain = &opened.plan.domain;
         let scene = Scene::assemble(

@@ -207,7 +207,7 @@ int main(int, char** arguments) {
             }
         }
         const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
-        std::vector<float> film(8 * pixels, NAN), squared(2 * pixels, NAN), tiles(size_t(across) * down * TILE_FIELDS, NAN);
+        std::vector<float> film(9 * pixels, NAN), squared(2 * pixels, NAN), tiles(size_t(across) * down * TILE_FIELDS, NAN);
         c.sums = sums.data(), c.base = base.data(), c.halves = halves.data();
         c.film = film.data(), c.squared = squared.data(), c.tiles = tiles.data();
         for (int row = 0; row < down; ++row) {

@@ -2,8 +2,8 @@
 
 use crate::cuda::DeviceError;
 use crate::cuda::driver_error;
-use cudarc::driver::{CudaContext, CudaStream, result};
-use std::ops::Range;
+use cudarc::driver::{CudaContext, CudaStream, result, sys};
+use std::ffi::c_void;
 use std::sync::Arc;
 
 /// Pinned values. The device may write them at any time between [`Self::copy_from`] and the next synchronisation of its stream, so a caller
@@ -52,25 +52,10 @@ impl<T: Copy + Default> Pinned<T> {
     /// # Safety
     /// The address `from` holds `count` values when the stream executes the copy.
     pub(in crate::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
-        // SAFETY: guaranteed by the caller.
-        unsafe { self.copy_behind(stream, from, 0..count) }
-    }
-
-    /// As [`Self::copy_from`], to a range of this memory.
-    ///
-    /// # Errors
-    /// A driver call fails.
-    ///
-    /// # Panics
-    /// The range ends behind [`Self::len`].
-    ///
-    /// # Safety
-    /// The address `from` holds as many values when the stream executes the copy.
-    pub(in crate::cuda) unsafe fn copy_behind(&mut self, stream: &CudaStream, from: u64, range: Range<usize>) -> Result<(), DeviceError> {
         // SAFETY: the allocation has `len` values, and `&mut self` is the only access to them.
-        let to = unsafe { &mut front(self.values, self.len, range.end)[range.start..] };
+        let to = unsafe { front(self.values, self.len, count) };
         // SAFETY: guaranteed by the caller; the host memory lives until `drop`, where the driver waits for copies in progress.
-        unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(driver_error("copying from the device"))
+        unsafe { copy_to_host(stream, from, to) }
     }
 
     /// Returns the values. The caller has synchronised the stream of the last copy.
@@ -78,6 +63,46 @@ impl<T: Copy + Default> Pinned<T> {
         // SAFETY: initialised in `new`; the caller waits for copies in progress, as the type requires.
         unsafe { std::slice::from_raw_parts(self.values, self.len) }
     }
+}
+
+/// Memory of somebody else that is pinned while this lives.
+pub(in crate::cuda) struct Registered {
+    address: usize,
+    context: Arc<CudaContext>,
+}
+
+impl Registered {
+    /// Pins the pages of `values`, whose owner drops the result before it frees them.
+    ///
+    /// # Errors
+    /// The driver does not pin them, such as pages that are pinned already.
+    pub(in crate::cuda) fn new(context: &Arc<CudaContext>, values: &mut [f32]) -> Result<Self, DeviceError> {
+        let doing = driver_error("pinning host memory");
+        context.bind_to_thread().map_err(&doing)?;
+        let first: *mut f32 = values.as_mut_ptr();
+        // SAFETY: the range is memory of this process.
+        unsafe { sys::cuMemHostRegister_v2(first.cast(), size_of_val(values), 0) }.result().map_err(doing)?;
+        Ok(Self { address: first as usize, context: context.clone() })
+    }
+}
+
+impl Drop for Registered {
+    fn drop(&mut self) {
+        // SAFETY: registered in `new`, and not unregistered yet.
+        let _ = self.context.bind_to_thread().and_then(|()| unsafe { sys::cuMemHostUnregister(self.address as *mut c_void) }.result());
+    }
+}
+
+/// Enqueues a copy from the device address `from`.
+///
+/// # Errors
+/// A driver call fails.
+///
+/// # Safety
+/// The address holds as many values when the stream executes the copy, and the host memory lives and is not accessed until then.
+pub(in crate::cuda) unsafe fn copy_to_host<T>(stream: &CudaStream, from: u64, to: &mut [T]) -> Result<(), DeviceError> {
+    // SAFETY: guaranteed by the caller.
+    unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(driver_error("copying from the device"))
 }
 
 /// The first `count` of `len` values. The check is not left to debug builds: the device would write behind the allocation.

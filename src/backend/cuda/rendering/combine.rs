@@ -5,11 +5,12 @@
 
 use super::coupled::SUM_PLANES;
 use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
-use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::driver::pinned::{Pinned, Registered, copy_to_host};
 use crate::cuda::layout::device_repr;
-use crate::cuda::{Buffer, DeviceError, Gpu, driver_error, launch, threads};
-use cudarc::driver::{CudaEvent, CudaFunction, LaunchConfig, PushKernelArg};
+use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
+use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_render::Combine as Combination;
+use ridgewatch_render::Film;
 use ridgewatch_render::smooth::{TILE, TileSums};
 use std::sync::Arc;
 
@@ -22,9 +23,6 @@ const BOX_ROW: usize = 1024;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
 /// First plane of the pairs by quarter in the sums (see [`SUM_PLANES`]).
 const PAIR_COUNTS: usize = 12;
-/// Floats of a pixel of the film, and of them those that are complete before the error.
-const FILM_PLANES: usize = 8;
-const SHOWN_PLANES: usize = 5;
 /// Of `regression.cuh`: features, sums of the normal equations.
 const FEATURES: usize = 4;
 const NORMAL_SUMS: usize = FEATURES * (FEATURES + 1) / 2 + 2 * FEATURES + 1;
@@ -113,56 +111,47 @@ pub struct CombineInput<'a> {
     pub lit: f32,
 }
 
-/// A finished film on its way to pinned memory; one value a pixel, rows from the top.
-pub struct FilmPlanes<'a> {
-    pinned: &'a Pinned<f32>,
-    pixels: usize,
-    arrivals: [&'a CudaEvent; 2],
+/// A film whose memory is pinned, so that the device writes into it.
+#[derive(Default)]
+pub struct PinnedFilm {
+    // Unpinned before it can be freed.
+    _pins: Vec<Registered>,
+    film: Arc<Film>,
 }
 
-/// The planes that are complete before the error.
-pub struct ShownPlanes<'a> {
-    /// Linear radiance and alpha.
-    pub rgba: &'a [[f32; 4]],
-    /// Mean FTLE; NaN where alpha is 0.
-    pub ftle_mean: &'a [f32],
-}
-
-/// The other planes.
-pub struct MeasuredPlanes<'a> {
-    /// Stated error of the radiance; see [`GpuCombine::finish`].
-    pub error: &'a [f32],
-    /// Share seen through missing cells.
-    pub missing: &'a [f32],
-    /// Samples, two a pair.
-    pub samples: &'a [f32],
-}
-
-impl<'a> FilmPlanes<'a> {
-    /// Waits for the first planes.
-    ///
-    /// # Errors
-    /// The device fails.
-    pub fn shown(&self) -> Result<ShownPlanes<'a>, DeviceError> {
-        wait(self.arrivals[0])?;
-        let (rgba, rest) = self.pinned.values().split_at(4 * self.pixels);
-        Ok(ShownPlanes { rgba: bytemuck::cast_slice(rgba), ftle_mean: &rest[..self.pixels] })
+impl PinnedFilm {
+    /// A film of this size. Memory that the driver does not pin is written all the same, but more slowly.
+    pub fn new(gpu: &Gpu, width: usize, height: usize) -> Self {
+        /// Floats of a page, so that no two planes share one, which could be pinned once only.
+        const PAGE: usize = 1024;
+        fn plane<T: Copy + Default>(pixels: usize) -> Vec<T> {
+            let mut values = Vec::with_capacity(pixels + PAGE);
+            values.resize(pixels, T::default());
+            values
+        }
+        let mut film = Film { width, height, rgba: plane(width * height), ..Film::default() };
+        for values in planes_of(&mut film) {
+            *values = plane(width * height);
+        }
+        let mut pins = vec![Registered::new(gpu.context(), film.rgba.as_flattened_mut())];
+        pins.extend(planes_of(&mut film).map(|values| Registered::new(gpu.context(), values)));
+        Self { _pins: pins.into_iter().filter_map(Result::ok).collect(), film: Arc::new(film) }
     }
 
-    /// Waits for the other planes.
-    ///
-    /// # Errors
-    /// The device fails.
-    pub fn measured(&self) -> Result<MeasuredPlanes<'a>, DeviceError> {
-        wait(self.arrivals[1])?;
-        let plane = |number: usize| &self.pinned.values()[number * self.pixels..(number + 1) * self.pixels];
-        Ok(MeasuredPlanes { error: plane(5), missing: plane(6), samples: plane(7) })
+    /// The film.
+    pub fn film(&self) -> &Arc<Film> {
+        &self.film
+    }
+
+    /// Returns true if nobody else holds the film, so that it can be filled again.
+    pub fn is_spare(&self) -> bool {
+        Arc::strong_count(&self.film) == 1
     }
 }
 
-/// Waits for the work before an event.
-fn wait(event: &CudaEvent) -> Result<(), DeviceError> {
-    event.synchronize().map_err(driver_error("waiting for a picture"))
+/// Planes of a film that follow its colours in the memory of the device, in their order there.
+fn planes_of(film: &mut Film) -> [&mut Vec<f32>; 5] {
+    [&mut film.ftle_mean, &mut film.error, &mut film.missing, &mut film.samples, &mut film.traced]
 }
 
 /// Offsets of the planes of the working memory. The film overwrites planes that only the shrinkage needs.
@@ -192,7 +181,7 @@ const PLANES: Planes = Planes {
     mean: 20,
     halves: 23,
     film: 0,
-    squared: 8,
+    squared: 9,
     guides: 37,
     around: 45,
     rest: 29,
@@ -219,11 +208,8 @@ pub struct GpuCombine {
     normal_sums: Option<Buffer<f64>>,
     tile_sums: Option<Buffer<f32>>,
     tiles_read: Option<Pinned<f32>>,
-    film_read: Option<Pinned<f32>>,
-    /// Argument of the picture that [`Self::finish`] completes, and the arrival of its first planes.
-    begun: Option<(CombineArgument, CudaEvent)>,
-    /// Arrivals of the planes of a finished film.
-    arrivals: Option<[CudaEvent; 2]>,
+    /// Argument of the picture that [`Self::finish`] completes.
+    begun: Option<CombineArgument>,
 }
 
 impl GpuCombine {
@@ -251,9 +237,7 @@ impl GpuCombine {
             normal_sums: None,
             tile_sums: None,
             tiles_read: None,
-            film_read: None,
             begun: None,
-            arrivals: None,
         })
     }
 
@@ -334,12 +318,8 @@ impl GpuCombine {
         let read = pinned_room(&gpu, &mut self.tiles_read, count)?;
         // SAFETY: `tile_sums` holds `count` values.
         unsafe { read.copy_from(gpu.work(), tile_sums, count) }?;
-        let has_tiles = gpu.mark()?;
-        let film = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
-        // SAFETY: the planes hold the film.
-        unsafe { film.copy_from(gpu.work(), argument.film, SHOWN_PLANES * pixels) }?;
-        self.begun = Some((argument, gpu.mark()?));
-        wait(&has_tiles)?;
+        gpu.synchronize()?;
+        self.begun = Some(argument);
         Ok(bytemuck::cast_slice(&read.values()[..count]))
     }
 
@@ -424,7 +404,7 @@ impl GpuCombine {
         unsafe { launch(call.arg(&from).arg(&to).arg(&across).arg(&down).arg(&radius), config) }
     }
 
-    /// Completes the film of the latest [`Self::combine`], on its way to the host. The error of a pixel is the root of the mean squared error over
+    /// Completes the film of the latest [`Self::combine`] and copies it, without FTLE and missing cells if `film` shows the same march already. The error of a pixel is the root of the mean squared error over
     /// a square of `radius` pixels (a power of two, at most 32), which is at least `floor`, plus `added`.
     ///
     /// # Errors
@@ -432,9 +412,9 @@ impl GpuCombine {
     ///
     /// # Panics
     /// If the radius is not one of those.
-    pub fn finish(&mut self, radius: u32, floor: f32, added: f32) -> Result<FilmPlanes<'_>, DeviceError> {
+    pub fn finish(&mut self, radius: u32, floor: f32, added: f32, film: &mut PinnedFilm, shows_march: bool) -> Result<(), DeviceError> {
         assert!(radius.is_power_of_two() && radius <= RADIUS as u32, "a radius that the kernels can sum");
-        let (Some((argument, shown)), Some(planes)) = (self.begun.take(), &self.planes) else {
+        let (Some(argument), Some(planes)) = (self.begun.take(), &self.planes) else {
             return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
         };
         let size = [argument.width as usize, argument.height as usize];
@@ -448,12 +428,20 @@ impl GpuCombine {
             self.box_rows(argument.squared, boxed, size, radius)?;
             launch(&mut call, box_columns(size))?;
         }
-        let pinned = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
-        let rest = SHOWN_PLANES * pixels..FILM_PLANES * pixels;
-        // SAFETY: the planes hold the film.
-        unsafe { pinned.copy_behind(gpu.work(), planes.address_of(PLANES.film * pixels + rest.start), rest) }?;
-        let [shown, measured] = self.arrivals.insert([shown, gpu.mark()?]);
-        Ok(FilmPlanes { pinned, pixels, arrivals: [shown, measured] })
+        let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
+        let Some(film) = Arc::get_mut(&mut film.film) else { return refused("a film that is shown already") };
+        if [film.width, film.height] != size {
+            return refused("a film of another size");
+        }
+        let at = |plane: usize| argument.film + (plane * pixels * size_of::<f32>()) as u64;
+        // SAFETY: the planes hold the film; nothing reads or frees `film` before the copies have ended, below.
+        let copied = unsafe { copy_to_host(gpu.work(), at(0), film.rgba.as_flattened_mut()) }.and_then(|()| {
+            let planes = planes_of(film).into_iter().enumerate().filter(|(number, _)| !(shows_march && matches!(number, 0 | 2)));
+            // SAFETY: as above.
+            planes.map(|(number, values)| unsafe { copy_to_host(gpu.work(), at(4 + number), values) }).collect()
+        });
+        gpu.synchronize()?;
+        copied
     }
 }
 

@@ -303,7 +303,9 @@ fn checked_rays_agree() {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_device_agrees() {
-    use crate::cuda::{CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, RayCheck};
+    use crate::cuda::{
+        CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, PinnedFilm, RayCheck,
+    };
     let gpu = Gpu::open(0, &GpuSettings { poison: true, ..GpuSettings::default() }).unwrap();
     let (laid, mut march, mut combine) = (DeviceNodes::new(&gpu).unwrap(), GpuMarch::new(&gpu).unwrap(), GpuCombine::new(&gpu).unwrap());
     for case in cases().iter().filter(|case| !case.holes) {
@@ -327,8 +329,9 @@ fn a_device_agrees() {
             let input = CombineInput { size: [37, 23], pairs: &pairs, march: &march, how: None, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             let tiles = combine.combine(&input).unwrap();
             assert!(tiles.len() == 6 && tiles.iter().all(|tile| tile.all.pixels == 0.0));
-            let planes = combine.finish(8, 0.0, 0.0).unwrap();
-            let (film, measured) = (planes.shown().unwrap(), planes.measured().unwrap());
+            let mut film = PinnedFilm::new(&gpu, 37, 23);
+            combine.finish(8, 0.0, 0.0, &mut film, false).unwrap();
+            let film = film.film();
             with_medium(renderer, &mut |medium| {
                 let volume = LightVolume::new(medium, case.values, 1);
                 let mut apart = 0;
@@ -378,14 +381,15 @@ fn a_device_agrees() {
         let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
         let tiles = combine.combine(&input).unwrap();
         let measured: f64 = tiles.iter().map(|tile| f64::from(tile.all.squared[0])).sum();
-        let planes = combine.finish(8, 1e-4, 0.0).unwrap();
-        let (film, stated) = (planes.shown().unwrap(), planes.measured().unwrap());
+        let mut film = PinnedFilm::new(&gpu, width, height);
+        combine.finish(8, 1e-4, 0.0, &mut film, false).unwrap();
+        let film = film.film();
         if how.is_none() {
             let sum = |(&[red, green, blue, alpha], &ftle): (&[f32; 4], &f32)| {
                 let ftle = if alpha > 0.0 { ftle * alpha } else { 0.0 };
                 RaySum { radiance: [red, green, blue], alpha, ftle, missing: 0.0 }
             };
-            base = film.rgba.iter().zip(film.ftle_mean).map(sum).collect::<Vec<RaySum>>();
+            base = film.rgba.iter().zip(&film.ftle_mean).map(sum).collect::<Vec<RaySum>>();
         }
         let combined = ridgewatch_render::smooth::combine(&sums, &Guides::new(&base, 1, width), correction);
         let mean: Vec<f32> = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect();
@@ -398,7 +402,7 @@ fn a_device_agrees() {
                 assert!((found - expected).abs() <= 1e-4, "{correction:?}, pixel {i}: {found} and {expected}");
             }
             let expected = errors[i].max(1e-4).sqrt();
-            assert!((stated.error[i] - expected).abs() <= 1e-4 * (1.0 + expected), "{correction:?}, pixel {i}");
+            assert!((film.error[i] - expected).abs() <= 1e-4 * (1.0 + expected), "{correction:?}, pixel {i}");
         }
     }
 }
@@ -472,7 +476,7 @@ fn combined_pictures_agree() {
             let output = ask("combine", &input);
             let mut output = &output[..];
             let rgba = read::<[f32; 4]>(&mut output, pixels);
-            let [ftle, error, missing, samples] = [(); 4].map(|()| read::<f32>(&mut output, pixels));
+            let [ftle, error, missing, samples, traced] = [(); 5].map(|()| read::<f32>(&mut output, pixels));
             let tiles = read::<[f32; 23]>(&mut output, width.div_ceil(16) * height.div_ceil(16));
 
             let ray = |b: &[f64; 6]| {
@@ -505,7 +509,7 @@ fn combined_pictures_agree() {
                 assert!(same(rgba[i][3], alpha, 1.0), "{what}, pixel {i}");
                 let mean_ftle = if b[3] > 0.0 { (b[4] / b[3]) as f32 } else { f32::NAN };
                 assert!(same(ftle[i], mean_ftle, 0.0) && same(missing[i], (b[5] / rays) as f32, 0.0), "{what}, pixel {i}");
-                assert_eq!(samples[i], 2.0 * s.pairs() as f32);
+                assert_eq!((samples[i], traced[i]), (2.0 * s.pairs() as f32, if s.pairs() > 0 { 1.0 } else { 0.0 }));
                 let expected = (errors[i].max(floor) + added).sqrt();
                 assert!(same(error[i], expected, 0.3), "{what}, pixel {i}: {} and {expected}", error[i]);
                 let tile = &mut expected_tiles[i / width / 16 * width.div_ceil(16) + i % width / 16];

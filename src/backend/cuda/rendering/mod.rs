@@ -16,7 +16,7 @@ mod router;
 mod smooth;
 
 pub use audit::Audits;
-pub use combine::{CombineInput, FilmPlanes, GpuCombine, MeasuredPlanes, ShownPlanes};
+pub use combine::{CombineInput, GpuCombine, PinnedFilm};
 pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;

@@ -2,7 +2,7 @@
 //! result. The algorithm and its reference are in [`ridgewatch_render::smooth`]; how finely to march and where to sample is decided there as well.
 
 use super::bricks::{DeviceBricks, Wanted};
-use super::combine::{CombineInput, FilmPlanes, GpuCombine, MeasuredPlanes, ShownPlanes};
+use super::combine::{CombineInput, GpuCombine, PinnedFilm};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 use super::predictor::Predictor;
@@ -51,9 +51,16 @@ pub(in crate::cuda) struct GpuSmooth {
     control: MarchControl,
     allocation: Allocation,
     pairs: u64,
-    /// The latest films. Those that nobody holds any more are filled again, since new memory is mapped page by page at the first write, which takes
-    /// longer than the copy.
-    films: Vec<Arc<Film>>,
+    /// Marches so far, of all pictures.
+    marches: u64,
+    /// The latest films. Those that nobody holds any more are filled again, since it takes longer to map and pin memory than to fill it.
+    films: Vec<KeptFilm>,
+}
+
+/// A film and the number of the march that it shows.
+struct KeptFilm {
+    film: PinnedFilm,
+    march: u64,
 }
 
 /// One round of refinement.
@@ -103,6 +110,7 @@ impl GpuSmooth {
             control: MarchControl::default(),
             allocation: Allocation::default(),
             pairs: 0,
+            marches: 0,
             films: Vec::new(),
         })
     }
@@ -181,6 +189,7 @@ impl GpuSmooth {
             (_, false) => Some(Combine::Shrink),
         };
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
+        let mut film = self.spare_film(width, height);
         let error = loop {
             if stats.stopped || round.stop.load(Ordering::Relaxed) {
                 self.shows = None;
@@ -207,26 +216,24 @@ impl GpuSmooth {
         };
         let march = self.control.error();
         let floor = if error.is_known() { ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0) } else { 0.0 };
-        let mut film = self.spare_film(width, height);
-        let planes = self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?;
-        match Arc::get_mut(&mut film) {
-            Some(film) => fill(film, &planes)?,
-            None => return Err(unsupported("a film that is shown already")),
-        }
+        let shows_march = film.march == self.marches;
+        self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32, &mut film.film, shows_march)?;
+        film.march = self.marches;
         if self.films.len() == FILMS {
             self.films.remove(0);
         }
-        self.films.push(film.clone());
+        let shown = film.film.film().clone();
+        self.films.push(film);
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
-        Ok(Some((film, stats, error)))
+        Ok(Some((shown, stats, error)))
     }
 
     /// A film of this size that nobody else holds.
-    fn spare_film(&mut self, width: usize, height: usize) -> Arc<Film> {
-        let is_spare = |film: &Arc<Film>| Arc::strong_count(film) == 1 && (film.width, film.height) == (width, height);
-        match self.films.iter().position(is_spare) {
+    fn spare_film(&mut self, width: usize, height: usize) -> KeptFilm {
+        let fits = |kept: &KeptFilm| kept.film.is_spare() && [kept.film.film().width, kept.film.film().height] == [width, height];
+        match self.films.iter().position(fits) {
             Some(spare) => self.films.swap_remove(spare),
-            None => Arc::new(Film { width, height, ..Film::default() }),
+            None => KeptFilm { film: PinnedFilm::new(&self.gpu, width, height), march: 0 },
         }
     }
 
@@ -241,6 +248,7 @@ impl GpuSmooth {
         let shows = self.shows.take();
         let medium = medium(&self.nodes, round, parameters)?;
         let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
+        self.marches += 1;
         self.march.march(&medium, step, due as u32, round.is_sum())?;
         let random = FrameRandom::new(renderer.scene().seed, self.number);
         let pixels = self.control.audit_pixels(&random, parameters.pixels());
@@ -342,23 +350,4 @@ fn node_grid<'a>(nodes: &'a DeviceNodes, round: &SmoothRound<'a>) -> Result<Node
 
 fn medium<'a>(nodes: &'a DeviceNodes, round: &SmoothRound<'a>, parameters: &'a FrameParameters) -> Result<Medium<'a>, DeviceError> {
     Ok(Medium { parameters, nodes: node_grid(nodes, round)?, missing_cells: round.tracer.missing_cells() })
-}
-
-/// Copies the planes as they arrive, with all threads.
-fn fill(film: &mut Film, planes: &FilmPlanes<'_>) -> Result<(), DeviceError> {
-    use rayon::prelude::*;
-    const CHUNK: usize = 1 << 16;
-    fn put<T: Copy + Default + Send + Sync, F: Copy + Sync>(to: &mut Vec<T>, from: &[F], value: impl Fn(F) -> T + Sync) {
-        to.resize(from.len(), T::default());
-        to.par_iter_mut().zip(from).with_min_len(CHUNK).for_each(|(to, from)| *to = value(*from));
-    }
-    let ShownPlanes { rgba, ftle_mean } = planes.shown()?;
-    put(&mut film.rgba, rgba, |v| v);
-    put(&mut film.ftle_mean, ftle_mean, |v| v);
-    let MeasuredPlanes { error, missing, samples } = planes.measured()?;
-    put(&mut film.error, error, |v| v);
-    put(&mut film.missing, missing, |v| v);
-    put(&mut film.samples, samples, |v| v);
-    put(&mut film.traced, samples, |samples| if samples > 0.0 { 1.0 } else { 0.0 });
-    Ok(())
 }
