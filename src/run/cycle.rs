@@ -269,6 +269,14 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) settled: Option<(StepChoice, PictureSteps)>,
 }
 
+/// Whether the simulation was lost, of which the slide's next frame then tells: the next window may never come.
+fn is_lost(slides: &mut dyn Slides, slide: &mut Slide) -> bool {
+    let loss = slides.loss();
+    let is_lost = !loss.is_empty();
+    slide.warnings.extend(loss);
+    is_lost
+}
+
 /// What commands changed since the last frame, by what follows from it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Commands {
@@ -747,7 +755,7 @@ impl<B: Backend> Cycle<'_, B> {
             since_command = since_command.map(|frames: usize| frames + 1);
             if self.run.is_paused() {
                 if is_done || since_command.is_none_or(|frames| frames >= FRAMES_WHILE_PAUSED) {
-                    while !self.run.is_commanded_within(GLANCE) {
+                    while !self.run.is_commanded_within(GLANCE) && !is_lost(slides, slide) {
                         self.run.check_end()?;
                         transaction!(self, slide, run, on => run.checkpoint_if_due(on));
                     }
@@ -766,7 +774,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
-            if !self.is_commanded_meanwhile(slides)? {
+            if !self.is_another_due(slides, slide)? {
                 self.frames_before = number.min(most).saturating_sub(warmups);
                 return Ok(());
             }
@@ -780,19 +788,22 @@ impl<B: Backend> Cycle<'_, B> {
         Ok(())
     }
 
-    /// Whether a command comes while a simulation's next window is incomplete: the slide then gets another frame.
-    fn is_commanded_meanwhile(&mut self, slides: &dyn Slides) -> Result<bool, RunEnd> {
-        if self.run.options.steering.is_none() || slides.is_over() {
+    /// Whether the slide gets another frame, since a command comes or the simulation is lost while its next window is incomplete.
+    fn is_another_due(&mut self, slides: &mut dyn Slides, slide: &mut Slide) -> Result<bool, RunEnd> {
+        if slides.is_over() || (self.run.options.steering.is_none() && slide.live.is_none()) {
             return Ok(false);
         }
         let begin = Instant::now();
-        let mut is_commanded = false;
-        while !is_commanded && slides.is_awaited() == Some(true) {
-            is_commanded = self.run.is_commanded_within(GLANCE);
+        let mut is_due = false;
+        while !is_due && slides.is_awaited() == Some(true) {
+            is_due = is_lost(slides, slide) || self.run.is_commanded_within(GLANCE);
             self.run.check_end()?;
+            if self.run.options.steering.is_none() {
+                std::thread::sleep(GLANCE);
+            }
         }
         self.run.progress.waited += begin.elapsed().as_secs_f64();
-        Ok(is_commanded)
+        Ok(is_due)
     }
 
     fn finish(&mut self) -> Result<(), RunError> {

@@ -67,6 +67,11 @@ pub trait Slides: Send {
         Vec::new()
     }
 
+    /// Warnings since the last slide, if the source was lost since then. They are not given again.
+    fn loss(&mut self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Whether no further slide is given, whatever the source does.
     fn is_over(&self) -> bool {
         false
@@ -302,6 +307,10 @@ impl Slides for LiveSlides {
 
     fn is_awaited(&self) -> Option<bool> {
         Some(self.window.is_waited_for())
+    }
+
+    fn loss(&mut self) -> Vec<String> {
+        self.window.loss()
     }
 
     fn is_over(&self) -> bool {

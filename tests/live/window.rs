@@ -161,6 +161,32 @@ fn too_little_memory_is_refused_in_words() {
 }
 
 #[test]
+fn a_loss_is_told_at_once_and_once() {
+    let folder = Folder::new("loss");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    (0..4).for_each(|n| publish(&solver, n, n as f64, 1.0));
+    take(&window, |taken| newest(taken) == 3.0);
+    assert_eq!(window.loss(), Vec::<String>::new());
+    drop(solver);
+    let deadline = Instant::now() + Duration::from_secs(10);
+    let loss = loop {
+        let loss = window.loss();
+        if !loss.is_empty() || Instant::now() > deadline {
+            break loss;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    };
+    assert!(window.is_waited_for() && has(&loss, "has ended"), "without another window: {loss:?}");
+    assert_eq!(window.loss(), Vec::<String>::new());
+    // A window says it no second time.
+    let solver = producer(&folder, plane(8));
+    publish(&solver, 4, 4.0, 1.0);
+    let (_, warnings) = take(&window, |taken| newest(taken) == 4.0);
+    assert!(!has(&warnings, "has ended") && has(&warnings, "started anew"), "{warnings:?}");
+}
+
+#[test]
 fn a_simulation_that_ends_and_starts_anew_is_gone_on_with() {
     let folder = Folder::new("anew");
     let solver = producer(&folder, plane(8));

@@ -84,6 +84,8 @@ struct State {
     warnings: Vec<String>,
     warnings_left_out: u64,
     live: LiveRecord,
+    /// A block has ended since the window was last taken, and nobody was told.
+    lost: bool,
     /// No more steps will come.
     ended: bool,
 }
@@ -98,8 +100,19 @@ impl State {
             warnings: Vec::new(),
             warnings_left_out: 0,
             live: LiveRecord::default(),
+            lost: false,
             ended: false,
         }
+    }
+
+    /// Takes the warnings, and with them the loss of the simulation.
+    fn take_warnings(&mut self) -> Vec<String> {
+        self.lost = false;
+        let mut warnings = std::mem::take(&mut self.warnings);
+        if std::mem::take(&mut self.warnings_left_out) > 0 {
+            warnings.push(format!("and more of that kind: only the first {MAX_WARNINGS} are listed"));
+        }
+        warnings
     }
 
     fn warn(&mut self, text: String) {
@@ -222,10 +235,7 @@ impl LiveWindow {
             state = self.shared.changed.wait_timeout(state, until - now).map_or_else(|broken| broken.into_inner().0, |(state, _)| state);
         }
         (state.moved, state.taken) = (0, true);
-        let mut warnings = std::mem::take(&mut state.warnings);
-        if std::mem::take(&mut state.warnings_left_out) > 0 {
-            warnings.push(format!("and more of that kind: only the first {MAX_WARNINGS} are listed"));
-        }
+        let warnings = state.take_warnings();
         let mut live = state.live.clone();
         live.age = since(live.published);
         live.snapshots = state.window.snapshots().len();
@@ -233,6 +243,12 @@ impl LiveWindow {
         drop(state);
         self.shared.changed.notify_all();
         Ok(Some(Ok(Taken { window, warnings, live })))
+    }
+
+    /// The warnings so far, if the simulation was lost since they were last taken: they do not wait for a window that may never come.
+    pub fn loss(&self) -> Vec<String> {
+        let mut state = self.shared.lock();
+        if state.lost { state.take_warnings() } else { Vec::new() }
     }
 
     /// True if [`Self::next_within`] would wait.
@@ -413,6 +429,7 @@ impl Reader {
         let mut state = self.shared.lock();
         let how = if closed { "has ended" } else { "is gone: its process ended without closing the ring, or its relay is gone" };
         state.warn(format!("the simulation {how} (block {block})"));
+        state.lost = true;
         if self.assembler.ended(block, generation) && self.live.settings.at_end == AtEnd::Stop {
             state.ended = true;
         }

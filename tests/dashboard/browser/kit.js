@@ -77,6 +77,20 @@ export async function startShown(folder, { more = [], ...options } = {}) {
   return { child, url: await printedUrl(child) };
 }
 
+/** A simulation that steps four times a second. */
+export function startSolver(ring) {
+  return start(["publish", "configs/turbulence_easy.toml", "--set", "source.nodes=[48,24,24]", "--ring", ring, "--rate", "4", "--steps", "100000"]);
+}
+
+/** A run beside the simulation of a ring, which can be steered, and the address of its page. */
+export async function startAttached(ring, folder) {
+  const small = ["render.width=96", "render.height=48", "render.budget=50", 'publish.exr="none"'].flatMap((key) => ["--set", key]);
+  const child = start(["attach", ring, "--tau", "11", "--device", "cpu", "--out", path.join(folder, "run"), "--publish", `ipc://${folder}/frames`, `--steer=ipc://${folder}/commands`, "--dashboard=0", "--json", ...small]);
+  child.text = "";
+  child.stdout.on("data", (part) => { child.text = (child.text + part).slice(-4000); });
+  return { child, url: await printedUrl(child) };
+}
+
 /** The server, and the port of its page. */
 export async function startDashboard(endpoint, folder, port = 0, token = TOKEN, more = []) {
   const file = path.join(folder, "token");
