@@ -436,9 +436,9 @@ impl GpuCombine {
         let at = |plane: usize| argument.film + (plane * pixels * size_of::<f32>()) as u64;
         // SAFETY: the planes hold the film; nothing reads or frees `film` before the copies have ended, below.
         let copied = unsafe { copy_to_host(gpu.work(), at(0), film.rgba.as_flattened_mut()) }.and_then(|()| {
-            let planes = planes_of(film).into_iter().enumerate().filter(|(number, _)| !(shows_march && matches!(number, 0 | 2)));
+            let mut planes = planes_of(film).into_iter().enumerate().filter(|(number, _)| !(shows_march && matches!(number, 0 | 2)));
             // SAFETY: as above.
-            planes.map(|(number, values)| unsafe { copy_to_host(gpu.work(), at(4 + number), values) }).collect()
+            planes.try_for_each(|(number, values)| unsafe { copy_to_host(gpu.work(), at(4 + number), values) })
         });
         gpu.synchronize()?;
         copied
