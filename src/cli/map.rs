@@ -65,7 +65,7 @@ pub struct Options {
     /// Percentile of the FTLE that --ridge-length of a ridge line reaches.
     #[arg(long, value_name = "P", default_value_t = Strength::LINES.percentile, value_parser = percentile)]
     ridge_percentile: f64,
-    /// Least length of a ridge line, in nodes of the ridge grid.
+    /// Least length of a ridge line that reaches the percentile, in nodes of the ridge grid.
     #[arg(long, value_name = "NODES", default_value_t = Strength::LINES.extent, value_parser = not_negative)]
     ridge_length: f64,
     /// Standard deviation of the smoothing before derivatives, in nodes of the ridge grid; 0 for none.

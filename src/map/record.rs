@@ -47,9 +47,9 @@ pub struct MapRecord {
 pub struct RidgeRecord {
     /// Nodes along x and y.
     pub grid: [usize; 2],
-    /// Percentile of the FTLE that the mean of a line reaches.
+    /// Percentile of the FTLE that `length` of a line reaches.
     pub percentile: f64,
-    /// Least length of a line, in nodes.
+    /// Least length of a line on which it reaches the percentile, in nodes.
     pub length: f64,
     /// Standard deviation of the smoothing, in nodes.
     pub smoothing: f64,

@@ -3,7 +3,8 @@
 //!
 //! With g the gradient, H the Hessian and e its unit eigenvector of the smaller eigenvalue: g . e = 0, and that eigenvalue is negative and the larger
 //! one by magnitude (Lindeberg, Edge detection and ridge detection with automatic scale selection, 1998). Cells are cut into triangles whose corners agree on the
-//! sign of e (Furst and Pizer, Marching ridges, 2001).
+//! sign of the direction across (Furst and Pizer, Marching ridges, 2001): e, but on the flanks of a ridge, where H has no such eigenvalue, that of H squared
+//! with a share of the neighbours'. The eigenvalues are tested at the crossing.
 
 use super::contour::{Edge, Segments};
 use super::smoothing::smoothed;
@@ -104,7 +105,8 @@ impl Field {
         let sharp = least_sharpness(found.iter().flatten().map(|(_, point)| point.sharpness), strength.sharpness);
         let mut segments = Segments::new();
         found.into_iter().filter(|ends| ends.iter().all(|(_, point)| point.sharpness >= sharp)).for_each(|ends| segments.add(ends));
-        segments.lines().into_iter().filter(|line| self.strong_length(line, least) >= strength.extent).collect()
+        let is_strong = |line: &Vec<RidgePoint>| self.strong_length(line, least) >= strength.extent.max(f64::MIN_POSITIVE);
+        segments.lines().into_iter().filter(is_strong).collect()
     }
 
     /// Length of a line where the field is `least` or more, in nodes.
@@ -206,8 +208,13 @@ impl Field {
         };
         let between = |a: f64, b: f64| a + t * (b - a);
         let [near, far] = [first, second].map(|node| self.hessian(smooth, node));
-        let [smaller, larger] = eigenvalues([0, 1, 2].map(|k| between(near[k], far[k])));
-        if smaller >= -self.rounding(first, *largest) || smaller + larger > 0.0 {
+        let hessian = [0, 1, 2].map(|k| between(near[k], far[k]));
+        let [smaller, larger] = eigenvalues(hessian);
+        // Nodes take their directions from their neighbours too: the field may have a minimum across.
+        let [xx, xy, yy] = hessian;
+        let [x, y] = a.across;
+        let is_highest = x * x * xx + 2.0 * x * y * xy + y * y * yy < 0.0;
+        if !is_highest || smaller >= -self.rounding(first, *largest) || smaller + larger > 0.0 {
             return None;
         }
         let place = [0, 1].map(|k| self.origin[k] + self.step[k] * between(from[k] as f64, to[k] as f64));

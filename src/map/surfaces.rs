@@ -2,7 +2,8 @@
 //! for the FTLE Sadlo and Peikert, Efficient visualization of Lagrangian coherent structures by filtered AMR ridge extraction, IEEE TVCG 13, 2007).
 //!
 //! With g the gradient, H the Hessian and e its unit eigenvector of the smallest eigenvalue: g . e = 0, and that eigenvalue is negative and the largest
-//! one by magnitude. Cells are cut into six tetrahedra around a diagonal, whose corners agree on the sign of e (Furst and Pizer, Marching ridges, 2001).
+//! one by magnitude. Cells are cut into six tetrahedra around a diagonal, whose corners agree on the sign of the direction across (Furst and Pizer, Marching
+//! ridges, 2001), which on the flanks of a ridge is that of H squared with a share of the neighbours'. The eigenvalues are tested at the crossing.
 //! The place of a crossing depends on its edge alone, so that tetrahedra meet in shared vertices without gaps.
 
 use super::pieces::pieces;
@@ -86,7 +87,7 @@ impl Volume {
         let mut kept: Vec<(Surface, Vec<[u32; 3]>)> = pieces(&triangles)
             .into_par_iter()
             .map(|piece| (self.measured(&points, &piece, least), piece))
-            .filter(|(surface, _)| surface.strong_area >= strength.extent)
+            .filter(|(surface, _)| surface.strong_area >= strength.extent.max(f64::MIN_POSITIVE))
             .collect();
         kept.sort_by(|(a, _), (b, _)| b.area.total_cmp(&a.area));
         let mut found = Surfaces::default();
@@ -211,7 +212,7 @@ impl Volume {
             (Some(before), Some(after)) => cubic_zero([before, low, high, after]),
             _ => low / (low - high),
         };
-        let sharpness = self.sharpness(shapes, [from, to], t)?;
+        let sharpness = self.sharpness(shapes, [from, to], a.across, t)?;
         let [nx, ny, _] = self.size;
         let start = [from % nx, from / nx % ny, from / (nx * ny)];
         let place = std::array::from_fn(|k| self.origin[k] + self.step[k] * (start[k] as f64 + if axes >> k & 1 == 1 { t } else { 0.0 }));

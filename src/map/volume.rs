@@ -49,10 +49,14 @@ impl Volume {
     }
 
     /// Sharpness, minus the smallest eigenvalue of the Hessian, at the share `t` of the way between two nodes with shapes. `None` unless that eigenvalue
-    /// is negative beyond rounding, and the largest by magnitude.
-    pub(super) fn sharpness(&self, shapes: &Shapes, [from, to]: [usize; 2], t: f64) -> Option<f64> {
+    /// is negative beyond rounding, and the largest by magnitude, and the field has no minimum across.
+    pub(super) fn sharpness(&self, shapes: &Shapes, [from, to]: [usize; 2], across: [f64; 3], t: f64) -> Option<f64> {
         let [a, b] = [from, to].map(|node| self.hessian(&shapes.smooth, node, self.lengths(node)));
-        let (values, vectors) = eigen(std::array::from_fn(|k| std::array::from_fn(|l| a[k][l] + t * (b[k][l] - a[k][l]))));
+        let hessian: [[f64; 3]; 3] = std::array::from_fn(|k| std::array::from_fn(|l| a[k][l] + t * (b[k][l] - a[k][l])));
+        if (0..9).map(|n| across[n / 3] * hessian[n / 3][n % 3] * across[n % 3]).sum::<f64>() >= 0.0 {
+            return None;
+        }
+        let (values, vectors) = eigen(hessian);
         let smallest = (0..3).min_by(|k, l| values[*k].total_cmp(&values[*l]))?;
         let noise = noise(shapes.rounding, column(&vectors, smallest), self.lengths(from));
         let is_ridge = values[smallest] < -noise && values.iter().all(|value| *value <= -values[smallest]);

@@ -11,7 +11,7 @@ use super::record::Frame;
 use super::refine::Frames;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
-use super::slides::{Slide, Slides};
+use super::slides::{LOOK_UP, Slide, Slides};
 use super::steering::{Command, Range, Steering, drawn_by};
 use super::steps::{PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
@@ -267,14 +267,6 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) frames_before: usize,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
     pub(super) settled: Option<(StepChoice, PictureSteps)>,
-}
-
-/// Whether the simulation was lost, of which the slide's next frame then tells: the next window may never come.
-fn is_lost(slides: &mut dyn Slides, slide: &mut Slide) -> bool {
-    let loss = slides.loss();
-    let is_lost = !loss.is_empty();
-    slide.warnings.extend(loss);
-    is_lost
 }
 
 /// What commands changed since the last frame, by what follows from it.
@@ -691,6 +683,8 @@ impl<B: Backend> Cycle<'_, B> {
         let planned = warmups + time.frames_per_slide;
         let (mut number, mut since_command) = (0, None);
         loop {
+            // The next window may never come, so this one's next frame tells of a loss.
+            slide.warnings.extend(slides.loss());
             let commands = self.run.apply_commands();
             if commands > Commands::None {
                 since_command = Some(0);
@@ -755,7 +749,7 @@ impl<B: Backend> Cycle<'_, B> {
             since_command = since_command.map(|frames: usize| frames + 1);
             if self.run.is_paused() {
                 if is_done || since_command.is_none_or(|frames| frames >= FRAMES_WHILE_PAUSED) {
-                    while !self.run.is_commanded_within(GLANCE) && !is_lost(slides, slide) {
+                    while !self.run.is_commanded_within(GLANCE) && !slides.is_lost() {
                         self.run.check_end()?;
                         transaction!(self, slide, run, on => run.checkpoint_if_due(on));
                     }
@@ -774,7 +768,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
-            if !self.is_another_due(slides, slide)? {
+            if !self.is_another_due(slides, slide.live.is_some())? {
                 self.frames_before = number.min(most).saturating_sub(warmups);
                 return Ok(());
             }
@@ -789,18 +783,19 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// Whether the slide gets another frame, since a command comes or the simulation is lost while its next window is incomplete.
-    fn is_another_due(&mut self, slides: &mut dyn Slides, slide: &mut Slide) -> Result<bool, RunEnd> {
-        if slides.is_over() || (self.run.options.steering.is_none() && slide.live.is_none()) {
+    fn is_another_due(&mut self, slides: &dyn Slides, is_live: bool) -> Result<bool, RunEnd> {
+        let is_steered = self.run.options.steering.is_some();
+        if slides.is_over() || !(is_steered || is_live) {
             return Ok(false);
         }
         let begin = Instant::now();
         let mut is_due = false;
         while !is_due && slides.is_awaited() == Some(true) {
-            is_due = is_lost(slides, slide) || self.run.is_commanded_within(GLANCE);
-            self.run.check_end()?;
-            if self.run.options.steering.is_none() {
-                std::thread::sleep(GLANCE);
+            if !is_steered {
+                slides.wait_within(LOOK_UP);
             }
+            is_due = slides.is_lost() || self.run.is_commanded_within(GLANCE);
+            self.run.check_end()?;
         }
         self.run.progress.waited += begin.elapsed().as_secs_f64();
         Ok(is_due)

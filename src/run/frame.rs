@@ -301,7 +301,11 @@ impl Run<'_> {
         };
         let begin = Instant::now();
         let (mut trained, mut was_idle) = (0.0, false);
-        while trained < settings.seconds() && !self.stop.load(Ordering::Relaxed) && !self.is_commanded_within(Duration::ZERO) {
+        while trained < settings.seconds()
+            && !slides.is_lost()
+            && !self.stop.load(Ordering::Relaxed)
+            && !self.is_commanded_within(Duration::ZERO)
+        {
             let mut slice = (settings.seconds() - trained).min(TURN);
             if surrogate.trains_on_device() {
                 match self.learning.budget.due(self.began.elapsed().as_secs_f64()) {

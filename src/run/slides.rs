@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Interval at which a wait for a snapshot checks for a request to stop.
-const LOOK_UP: Duration = Duration::from_millis(100);
+pub(super) const LOOK_UP: Duration = Duration::from_millis(100);
 
 /// A position of the window in time, with the velocity to integrate.
 #[derive(Clone)]
@@ -67,9 +67,19 @@ pub trait Slides: Send {
         Vec::new()
     }
 
-    /// Warnings since the last slide, if the source was lost since then. They are not given again.
+    /// Warnings since the last slide, if the source was lost since then and may come back. They are not given again.
     fn loss(&mut self) -> Vec<String> {
         Vec::new()
+    }
+
+    /// Whether [`Self::loss`] has something to tell.
+    fn is_lost(&self) -> bool {
+        false
+    }
+
+    /// Waits for news of a running simulation, no longer than this.
+    fn wait_within(&self, limit: Duration) {
+        std::thread::sleep(limit);
     }
 
     /// Whether no further slide is given, whatever the source does.
@@ -311,6 +321,14 @@ impl Slides for LiveSlides {
 
     fn loss(&mut self) -> Vec<String> {
         self.window.loss()
+    }
+
+    fn is_lost(&self) -> bool {
+        self.window.is_lost()
+    }
+
+    fn wait_within(&self, limit: Duration) {
+        self.window.wait_within(limit);
     }
 
     fn is_over(&self) -> bool {

@@ -134,6 +134,11 @@ fn curved_ridges_close_and_filters_choose() {
     assert_eq!(count(Strength { percentile: 90.0, ..ALL }), 1, "the weaker one is below the percentile");
     assert_eq!(count(Strength { extent: 120.0, ..ALL }), 1, "the shorter one has 78 nodes");
     assert_eq!(count(Strength { extent: 400.0, ..ALL }), 0);
+    // A faint rest does not take a strong part along: of a circle whose strength falls from one side to the other, what is above the percentile counts.
+    let uneven = field([-1.0, -1.0], 0.02, [101, 101], |x, y| (1.0 + 0.2 * y) * profile(x.hypot(y), 0.7));
+    let most = Strength { percentile: 96.0, ..ALL };
+    let lengths = [60.0, 200.0].map(|extent| uneven.ridges(&Strength { extent, ..most }).len());
+    assert_eq!(lengths, [1, 0], "of 220 nodes a part reaches the percentile");
     // A hole cuts the circle open.
     squeezed.values[50 * 101 + 50 + 35] = f32::NAN;
     let cut = squeezed.ridges(&ALL);

@@ -84,8 +84,8 @@ struct State {
     warnings: Vec<String>,
     warnings_left_out: u64,
     live: LiveRecord,
-    /// A block has ended since the window was last taken, and nobody was told.
-    lost: bool,
+    /// Loss of the whole simulation, of which nobody was told yet.
+    lost: Option<String>,
     /// No more steps will come.
     ended: bool,
 }
@@ -100,18 +100,18 @@ impl State {
             warnings: Vec::new(),
             warnings_left_out: 0,
             live: LiveRecord::default(),
-            lost: false,
+            lost: None,
             ended: false,
         }
     }
 
     /// Takes the warnings, and with them the loss of the simulation.
     fn take_warnings(&mut self) -> Vec<String> {
-        self.lost = false;
         let mut warnings = std::mem::take(&mut self.warnings);
         if std::mem::take(&mut self.warnings_left_out) > 0 {
             warnings.push(format!("and more of that kind: only the first {MAX_WARNINGS} are listed"));
         }
+        warnings.extend(self.lost.take());
         warnings
     }
 
@@ -248,7 +248,20 @@ impl LiveWindow {
     /// The warnings so far, if the simulation was lost since they were last taken: they do not wait for a window that may never come.
     pub fn loss(&self) -> Vec<String> {
         let mut state = self.shared.lock();
-        if state.lost { state.take_warnings() } else { Vec::new() }
+        if state.lost.is_some() { state.take_warnings() } else { Vec::new() }
+    }
+
+    /// Whether [`Self::loss`] has something to tell.
+    pub fn is_lost(&self) -> bool {
+        self.shared.lock().lost.is_some()
+    }
+
+    /// Waits until the next window is complete or the simulation is lost or over, but no longer than this.
+    pub fn wait_within(&self, limit: Duration) {
+        let state = self.shared.lock();
+        if !state.due(self.stride) && !state.ended && state.lost.is_none() {
+            drop(self.shared.changed.wait_timeout(state, limit));
+        }
     }
 
     /// True if [`Self::next_within`] would wait.
@@ -428,10 +441,16 @@ impl Reader {
     fn ended(&mut self, block: u32, generation: u64, closed: bool) {
         let mut state = self.shared.lock();
         let how = if closed { "has ended" } else { "is gone: its process ended without closing the ring, or its relay is gone" };
-        state.warn(format!("the simulation {how} (block {block})"));
-        state.lost = true;
-        if self.assembler.ended(block, generation) && self.live.settings.at_end == AtEnd::Stop {
-            state.ended = true;
+        let text = format!("the simulation {how} (block {block})");
+        match (self.assembler.ended(block, generation), self.live.settings.at_end) {
+            (true, AtEnd::Wait) => {
+                tracing::info!("{text}");
+                state.lost = Some(text);
+            }
+            (is_whole, _) => {
+                state.warn(text);
+                state.ended |= is_whole;
+            }
         }
         drop(state);
         self.shared.changed.notify_all();

@@ -72,11 +72,14 @@ pub(in crate::cuda) struct Registered {
 }
 
 impl Registered {
-    /// Pins the pages of `values`, whose owner drops the result before it frees them.
+    /// Pins the pages of `values`.
     ///
     /// # Errors
     /// The driver does not pin them, such as pages that are pinned already.
-    pub(in crate::cuda) fn new(context: &Arc<CudaContext>, values: &mut [f32]) -> Result<Self, DeviceError> {
+    ///
+    /// # Safety
+    /// The result is dropped before the memory is freed.
+    pub(in crate::cuda) unsafe fn new(context: &Arc<CudaContext>, values: &mut [f32]) -> Result<Self, DeviceError> {
         let doing = driver_error("pinning host memory");
         context.bind_to_thread().map_err(&doing)?;
         let first: *mut f32 = values.as_mut_ptr();

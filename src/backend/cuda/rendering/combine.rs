@@ -112,7 +112,6 @@ pub struct CombineInput<'a> {
 }
 
 /// A film whose memory is pinned, so that the device writes into it.
-#[derive(Default)]
 pub struct PinnedFilm {
     // Unpinned before it can be freed.
     _pins: Vec<Registered>,
@@ -120,6 +119,16 @@ pub struct PinnedFilm {
 }
 
 impl PinnedFilm {
+    /// A film of this size that is not pinned, into which copies take longer.
+    pub fn unpinned(width: usize, height: usize) -> Self {
+        let film = Film { width, height, rgba: vec![[0.0; 4]; width * height], ..Film::default() };
+        let mut film = Self { _pins: Vec::new(), film: Arc::new(film) };
+        if let Some(own) = Arc::get_mut(&mut film.film) {
+            planes_of(own).into_iter().for_each(|values| values.resize(width * height, 0.0));
+        }
+        film
+    }
+
     /// A film of this size. Memory that the driver does not pin is written all the same, but more slowly.
     pub fn new(gpu: &Gpu, width: usize, height: usize) -> Self {
         /// Floats of a page, so that no two planes share one, which could be pinned once only.
@@ -133,8 +142,10 @@ impl PinnedFilm {
         for values in planes_of(&mut film) {
             *values = plane(width * height);
         }
-        let mut pins = vec![Registered::new(gpu.context(), film.rgba.as_flattened_mut())];
-        pins.extend(planes_of(&mut film).map(|values| Registered::new(gpu.context(), values)));
+        // SAFETY: the pins are dropped before the film, whose planes nobody else can change while this holds it.
+        let pin = |values: &mut [f32]| unsafe { Registered::new(gpu.context(), values) };
+        let mut pins = vec![pin(film.rgba.as_flattened_mut())];
+        pins.extend(planes_of(&mut film).map(|values| pin(values)));
         Self { _pins: pins.into_iter().filter_map(Result::ok).collect(), film: Arc::new(film) }
     }
 
@@ -188,7 +199,7 @@ const PLANES: Planes = Planes {
     count: 53,
 };
 
-/// Combines pictures. It reuses its memory between frames: 53 planes, and the film in pinned memory.
+/// Combines pictures. It reuses its memory between frames: 53 planes.
 pub struct GpuCombine {
     gpu: Arc<Gpu>,
     guides: CudaFunction,
@@ -250,7 +261,7 @@ impl GpuCombine {
     }
 
     /// Adds the correction to the picture, and returns the sums of each tile, rows of tiles from the top. Waits for them. The film is then complete
-    /// but for its error, and on its way to the host.
+    /// but for its error.
     ///
     /// # Errors
     /// The picture has no rays or another size, or the device fails or lacks memory.
@@ -404,7 +415,8 @@ impl GpuCombine {
         unsafe { launch(call.arg(&from).arg(&to).arg(&across).arg(&down).arg(&radius), config) }
     }
 
-    /// Completes the film of the latest [`Self::combine`] and copies it, without FTLE and missing cells if `film` shows the same march already. The error of a pixel is the root of the mean squared error over
+    /// Completes the film of the latest [`Self::combine`] and copies it to `film`; with `shows_march` without FTLE and missing cells, since `film` shows
+    /// the same march already. The error of a pixel is the root of the mean squared error over
     /// a square of `radius` pixels (a power of two, at most 32), which is at least `floor`, plus `added`.
     ///
     /// # Errors

@@ -30,8 +30,8 @@ const LIGHT_SHARE: u64 = 8;
 const MIN_MARCH_SECONDS: f64 = 0.005;
 /// Pairs of a tile in one call of the tracker.
 const MAX_PAIRS: usize = 256;
-/// Films that are kept to be filled again: one on its way and some in the hands of subscribers.
-const FILMS: usize = 4;
+/// Films that are kept to be filled again: one on its way, and those that wait for a slow disk.
+const FILMS: usize = 6;
 
 /// One picture that accumulates on the GPU. It reuses kernels and memory from picture to picture.
 pub(in crate::cuda) struct GpuSmooth {
@@ -219,22 +219,23 @@ impl GpuSmooth {
         let shows_march = film.march == self.marches;
         self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32, &mut film.film, shows_march)?;
         film.march = self.marches;
-        if self.films.len() == FILMS {
-            self.films.remove(0);
-        }
         let shown = film.film.film().clone();
-        self.films.push(film);
+        if self.films.len() < FILMS {
+            self.films.push(film);
+        }
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
         Ok(Some((shown, stats, error)))
     }
 
     /// A film of this size that nobody else holds.
     fn spare_film(&mut self, width: usize, height: usize) -> KeptFilm {
-        let fits = |kept: &KeptFilm| kept.film.is_spare() && [kept.film.film().width, kept.film.film().height] == [width, height];
-        match self.films.iter().position(fits) {
-            Some(spare) => self.films.swap_remove(spare),
-            None => KeptFilm { film: PinnedFilm::new(&self.gpu, width, height), march: 0 },
+        self.films.retain(|kept| [kept.film.film().width, kept.film.film().height] == [width, height]);
+        if let Some(spare) = self.films.iter().position(|kept| kept.film.is_spare()) {
+            return self.films.swap_remove(spare);
         }
+        // Pinning takes longer than a copy into memory that is not.
+        let is_kept = self.films.len() < FILMS;
+        KeptFilm { film: if is_kept { PinnedFilm::new(&self.gpu, width, height) } else { PinnedFilm::unpinned(width, height) }, march: 0 }
     }
 
     /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
