@@ -43,6 +43,11 @@ impl Strength {
     pub const LINES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 30.0, smoothing: 2.0 };
     /// Default of ridge surfaces, whose grids are coarser.
     pub const SURFACES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 100.0, smoothing: 1.0 };
+
+    /// Whether a ridge is kept of which this length or area reaches the percentile. Some of it must, however little is asked for.
+    pub(super) fn suffices(&self, strong: f64) -> bool {
+        strong > 0.0 && strong >= self.extent
+    }
 }
 
 /// A point of a ridge.
@@ -105,8 +110,7 @@ impl Field {
         let sharp = least_sharpness(found.iter().flatten().map(|(_, point)| point.sharpness), strength.sharpness);
         let mut segments = Segments::new();
         found.into_iter().filter(|ends| ends.iter().all(|(_, point)| point.sharpness >= sharp)).for_each(|ends| segments.add(ends));
-        let is_strong = |line: &Vec<RidgePoint>| self.strong_length(line, least) >= strength.extent.max(f64::MIN_POSITIVE);
-        segments.lines().into_iter().filter(is_strong).collect()
+        segments.lines().into_iter().filter(|line| strength.suffices(self.strong_length(line, least))).collect()
     }
 
     /// Length of a line where the field is `least` or more, in nodes.

@@ -87,7 +87,7 @@ impl Volume {
         let mut kept: Vec<(Surface, Vec<[u32; 3]>)> = pieces(&triangles)
             .into_par_iter()
             .map(|piece| (self.measured(&points, &piece, least), piece))
-            .filter(|(surface, _)| surface.strong_area >= strength.extent.max(f64::MIN_POSITIVE))
+            .filter(|(surface, _)| strength.suffices(surface.strong_area))
             .collect();
         kept.sort_by(|(a, _), (b, _)| b.area.total_cmp(&a.area));
         let mut found = Surfaces::default();
