@@ -111,7 +111,7 @@ pub struct CombineInput<'a> {
     pub lit: f32,
 }
 
-/// A film whose memory is pinned, so that the device writes into it.
+/// A film into which the device writes, pinned unless there are too many.
 pub struct PinnedFilm {
     // Unpinned before it can be freed.
     _pins: Vec<Registered>,
@@ -121,27 +121,12 @@ pub struct PinnedFilm {
 impl PinnedFilm {
     /// A film of this size that is not pinned, into which copies take longer.
     pub fn unpinned(width: usize, height: usize) -> Self {
-        let film = Film { width, height, rgba: vec![[0.0; 4]; width * height], ..Film::default() };
-        let mut film = Self { _pins: Vec::new(), film: Arc::new(film) };
-        if let Some(own) = Arc::get_mut(&mut film.film) {
-            planes_of(own).into_iter().for_each(|values| values.resize(width * height, 0.0));
-        }
-        film
+        Self { _pins: Vec::new(), film: Arc::new(blank(width, height)) }
     }
 
     /// A film of this size. Memory that the driver does not pin is written all the same, but more slowly.
     pub fn new(gpu: &Gpu, width: usize, height: usize) -> Self {
-        /// Floats of a page, so that no two planes share one, which could be pinned once only.
-        const PAGE: usize = 1024;
-        fn plane<T: Copy + Default>(pixels: usize) -> Vec<T> {
-            let mut values = Vec::with_capacity(pixels + PAGE);
-            values.resize(pixels, T::default());
-            values
-        }
-        let mut film = Film { width, height, rgba: plane(width * height), ..Film::default() };
-        for values in planes_of(&mut film) {
-            *values = plane(width * height);
-        }
+        let mut film = blank(width, height);
         // SAFETY: the pins are dropped before the film, whose planes nobody else can change while this holds it.
         let pin = |values: &mut [f32]| unsafe { Registered::new(gpu.context(), values) };
         let mut pins = vec![pin(film.rgba.as_flattened_mut())];
@@ -158,6 +143,20 @@ impl PinnedFilm {
     pub fn is_spare(&self) -> bool {
         Arc::strong_count(&self.film) == 1
     }
+}
+
+/// A film with the planes that the device writes.
+fn blank(width: usize, height: usize) -> Film {
+    /// Floats of a page, so that no two planes share one, which could be pinned once only.
+    const PAGE: usize = 1024;
+    fn plane<T: Copy + Default>(pixels: usize) -> Vec<T> {
+        let mut values = Vec::with_capacity(pixels + PAGE);
+        values.resize(pixels, T::default());
+        values
+    }
+    let mut film = Film { width, height, rgba: plane(width * height), ..Film::default() };
+    planes_of(&mut film).into_iter().for_each(|values| *values = plane(width * height));
+    film
 }
 
 /// Planes of a film that follow its colours in the memory of the device, in their order there.
@@ -416,11 +415,11 @@ impl GpuCombine {
     }
 
     /// Completes the film of the latest [`Self::combine`] and copies it to `film`; with `shows_march` without FTLE and missing cells, since `film` shows
-    /// the same march already. The error of a pixel is the root of the mean squared error over
-    /// a square of `radius` pixels (a power of two, at most 32), which is at least `floor`, plus `added`.
+    /// the same march already. The error of a pixel is the root of the mean squared error over a square of `radius` pixels (a power of two, at most 32),
+    /// which is at least `floor`, plus `added`.
     ///
     /// # Errors
-    /// Nothing was combined, or the device fails or lacks memory.
+    /// Nothing was combined, `film` is held elsewhere or has another size, or the device fails or lacks memory.
     ///
     /// # Panics
     /// If the radius is not one of those.
