@@ -169,14 +169,11 @@ fn a_loss_is_told_at_once_and_once() {
     take(&window, |taken| newest(taken) == 3.0);
     assert_eq!(window.loss(), Vec::<String>::new());
     drop(solver);
-    let deadline = Instant::now() + Duration::from_secs(10);
-    let loss = loop {
-        let loss = window.loss();
-        if !loss.is_empty() || Instant::now() > deadline {
-            break loss;
-        }
-        std::thread::sleep(Duration::from_millis(2));
-    };
+    let mut loss = Vec::new();
+    until("the loss", || {
+        loss = window.loss();
+        !loss.is_empty()
+    });
     assert!(window.is_waited_for() && has(&loss, "has ended"), "without another window: {loss:?}");
     assert_eq!(window.loss(), Vec::<String>::new());
     // A window says it no second time.

@@ -45,7 +45,8 @@ function start(args) {
   const child = spawn(PROGRAM, args, { cwd: REPOSITORY, stdio: ["ignore", "pipe", "pipe"] });
   children.add(child);
   child.once("exit", () => children.delete(child));
-  child.log = "";
+  [child.text, child.log] = ["", ""];
+  child.stdout.on("data", (text) => { child.text = (child.text + text).slice(-4000); });
   child.stderr.on("data", (text) => { child.log = (child.log + text).slice(-4000); });
   return child;
 }
@@ -60,8 +61,6 @@ export async function stop(child, signal = "SIGTERM") {
 export function startPublisher(endpoint, folder, { scene = "configs/double_gyre.toml", changes = {}, more = [] } = {}) {
   const settings = Object.entries({ ...SMALL, ...changes }).filter(([, value]) => value !== null).flatMap(([key, value]) => ["--set", `${key}=${value}`]);
   const child = start(["replay", scene, "--device", "cpu", "--publish", endpoint, "--out", path.join(folder, "run"), "--overwrite", ...settings, ...more]);
-  child.text = "";
-  child.stdout.on("data", (part) => { child.text = (child.text + part).slice(-4000); });
   child.once("exit", (code) => { if (code) console.error(`the publisher ended: ${child.log}`); });
   return child;
 }
@@ -86,8 +85,6 @@ export function startSolver(ring) {
 export async function startAttached(ring, folder) {
   const small = ["render.width=96", "render.height=48", "render.budget=50", 'publish.exr="none"'].flatMap((key) => ["--set", key]);
   const child = start(["attach", ring, "--tau", "11", "--device", "cpu", "--out", path.join(folder, "run"), "--publish", `ipc://${folder}/frames`, `--steer=ipc://${folder}/commands`, "--dashboard=0", "--json", ...small]);
-  child.text = "";
-  child.stdout.on("data", (part) => { child.text = (child.text + part).slice(-4000); });
   return { child, url: await printedUrl(child) };
 }
 
@@ -96,8 +93,6 @@ export async function startDashboard(endpoint, folder, port = 0, token = TOKEN, 
   const file = path.join(folder, "token");
   writeFileSync(file, `${token}\n`, { mode: 0o600 });
   const child = start(["dashboard", endpoint, "--port", String(port), "--token-file", file, "--json", ...more]);
-  child.text = "";
-  child.stdout.on("data", (part) => { child.text += part; });
   return { child, port: Number(new URL(await printedUrl(child)).port) };
 }
 
