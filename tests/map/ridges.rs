@@ -188,3 +188,83 @@ fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
     );
     assert!(coarse.len() >= 3 && distances.len() > 300 && at(0.5) < 0.05, "median {}", at(0.5));
 }
+
+/// Velocity of the double gyre below, in f64 and apart from the tracer.
+fn gyre([x, y]: [f64; 2], t: f64) -> [f64; 2] {
+    const PI: f64 = std::f64::consts::PI;
+    let wave = 0.25 * (TURN / 10.0 * t).sin();
+    let (f, slope) = (wave * x * x + (1.0 - 2.0 * wave) * x, 2.0 * wave * x + 1.0 - 2.0 * wave);
+    [-0.1 * PI * (PI * f).sin() * (PI * y).cos(), 0.1 * PI * (PI * f).cos() * (PI * y).sin() * slope]
+}
+
+/// Where the gyre carries a particle from one time to another, by the classical Runge-Kutta method.
+fn carried(mut at: [f64; 2], from: f64, to: f64) -> [f64; 2] {
+    let steps = (40.0 * (to - from).abs()).ceil();
+    let h = (to - from) / steps;
+    for n in 0..steps as usize {
+        let t = from + h * n as f64;
+        let moved = |k: [f64; 2], share: f64| [0, 1].map(|i| at[i] + share * h * k[i]);
+        let a = gyre(at, t);
+        let b = gyre(moved(a, 0.5), t + 0.5 * h);
+        let c = gyre(moved(b, 0.5), t + 0.5 * h);
+        let d = gyre(moved(c, 1.0), t + h);
+        at = [0, 1].map(|i| at[i] + h / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i]));
+    }
+    at
+}
+
+/// The stable manifold of the hyperbolic trajectory on the wall y = 0, at time 0: the particles that come within `near` of it by time `tau`.
+fn stable_manifold(tau: f64, near: f64) -> Vec<[f64; 2]> {
+    // Backward in time particles on the wall approach it.
+    let foot = carried([1.0, 0.0], tau + 50.0, tau)[0];
+    // Its direction there is that of y up to a part that shrinks on the way.
+    let at = |height: f64| carried([foot, height], tau, 0.0);
+    let mut line = vec![at(0.0)];
+    let (mut low, mut ends) = (0.0, vec![near]);
+    while let Some(&high) = ends.last() {
+        let (last, next) = (line[line.len() - 1], at(high));
+        if (next[0] - last[0]).hypot(next[1] - last[1]) > 0.002 && high - low > 1e-12 {
+            ends.push(0.5 * (low + high));
+        } else {
+            line.push(next);
+            (low, _) = (high, ends.pop());
+        }
+    }
+    line
+}
+
+/// The strongest ridge of the forward FTLE lies on the stable manifold of the hyperbolic trajectory on the wall, the more so the longer tau is (Shadden,
+/// Lekien and Marsden 2005). Other ridges beside it, which fold around it, are weaker.
+#[test]
+fn the_double_gyre_has_a_ridge_on_its_known_manifold() {
+    let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TURN / 10.0 };
+    let velocity = VelocitySource::Analytic(flow, Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0)));
+    let (origin, step, size) = ([1.0, 0.02], 0.0005, [441, 881]);
+    // At tau 10 the ridge is as narrow as a node.
+    for (tau, most) in [(6.0, 2.0), (8.0, 0.2), (10.0, 0.5)] {
+        let map = FlowMap { precision: Precision::F64, ..FlowMap::tangent(tau, 200) };
+        let place = |k: usize| [origin[0] + step * (k % size[0]) as f64, origin[1] + step * (k / size[0]) as f64];
+        let seeds: Vec<DomainPoint> = (0..size[0] * size[1]).map(place).map(|[x, y]| DomainPoint([x as f32, y as f32, 0.5])).collect();
+        let traced = trace(&velocity, &map, 0.0, &seeds, Extras::default());
+        let values = stretches(&traced).iter().map(|s| (s / tau) as f32).collect();
+        let field = Field { origin, step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] };
+        let ridges = field.ridges(&Strength { percentile: 80.0, extent: 100.0, ..ALL });
+        let mut manifold = stable_manifold(tau, 0.02);
+        manifold.retain(|at| (0..2).all(|k| at[k] > origin[k] + step && at[k] < origin[k] + step * (size[k] - 2) as f64));
+        let in_order = |mut cells: Vec<f64>| {
+            cells.sort_by(f64::total_cmp);
+            [0.5, 1.0].map(|share| cells[((cells.len() - 1) as f64 * share) as usize])
+        };
+        let to_ridge = |at: &[f64; 2]| ridges.iter().map(|line| distance(*at, line)).fold(f64::INFINITY, f64::min) / step;
+        let found = in_order(manifold.iter().map(to_ridge).collect());
+        let line: Vec<RidgePoint> = manifold.iter().map(|place| RidgePoint { place: *place, value: 0.0, sharpness: 0.0 }).collect();
+        let mut strongest: Vec<RidgePoint> = ridges.iter().flatten().copied().collect();
+        strongest.sort_by(|a, b| b.value.total_cmp(&a.value));
+        strongest.truncate(strongest.len() / 4);
+        let off = in_order(strongest.iter().map(|p| distance(p.place, &line) / step).collect());
+        println!(
+            "tau {tau}: the manifold is {found:.3?} cells from a ridge, the strongest ridge points are {off:.3?} cells from it (median, largest)"
+        );
+        assert!(manifold.len() > 200 && found[1] < most && off[0] < most, "tau {tau}: {found:?} {off:?}");
+    }
+}
