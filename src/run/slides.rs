@@ -319,6 +319,10 @@ impl Slides for LiveSlides {
         Some(self.window.is_waited_for())
     }
 
+    fn warnings(&mut self) -> Vec<String> {
+        self.window.warnings()
+    }
+
     fn loss(&mut self) -> Vec<String> {
         self.window.loss()
     }

@@ -1,7 +1,7 @@
 //! `publish`, `attach` and `relay` as programs.
 
 use crate::ALONE;
-use crate::kit::program::{self, LONG, Outcome, Running, run, start, text, until};
+use crate::kit::program::{self, LONG, Outcome, Running, run, start, summary, text, until};
 use crate::kit::ring::{self, Ring, grid};
 use crate::kit::scene;
 use serde_json::Value;
@@ -142,6 +142,8 @@ fn a_film_of_a_live_run_is_that_of_its_archive_whole_or_in_blocks() {
             assert_eq!(found["live"]["missed_blocks"], 0);
         }
         assert_eq!(pictures(&run), film, "{blocks}");
+        let warnings = summary(&run)["run"]["warnings"].to_string();
+        assert!(warnings.contains("the simulation has ended"), "{warnings}");
     }
     assert!(!place.ring.0.exists(), "nothing stays in /dev/shm");
 }

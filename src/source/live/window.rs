@@ -251,6 +251,11 @@ impl LiveWindow {
         if state.lost.is_some() { state.take_warnings() } else { Vec::new() }
     }
 
+    /// The warnings since they were last taken, with the end of the simulation.
+    pub fn warnings(&self) -> Vec<String> {
+        self.shared.lock().take_warnings()
+    }
+
     /// Whether [`Self::loss`] has something to tell.
     pub fn is_lost(&self) -> bool {
         self.shared.lock().lost.is_some()
