@@ -232,6 +232,15 @@ pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Res
     Ok(())
 }
 
+/// Why `--verify` checks nothing, if it is given with a method that states no error of a surrogate.
+pub fn verifies_nothing(setup: &Setup, points: u64) -> Option<Usage> {
+    let method = setup.plan.scene.render.method;
+    (points > 0 && !method.has_surrogate()).then(|| {
+        let accepted = "accepted with methods two_level, marched, surrogate and gated";
+        Usage(format!("--verify {points}: method {} has no surrogate whose error could be checked; {accepted}", method.name()))
+    })
+}
+
 /// Refuses a running simulation, for a command that makes `what` of one moment.
 pub fn refuse_live(scene: &SceneFile, what: &str) -> Result<()> {
     if scene.source.kind == SourceKind::Live {

@@ -2,7 +2,7 @@
 
 use super::common::{
     Common, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene, settle_method,
-    text_with_tau,
+    text_with_tau, verifies_nothing,
 };
 use super::{messages, session};
 use anyhow::{Context, Result, bail};
@@ -84,6 +84,9 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let run_options = RunOptions { verify_points: options.verify as usize, threads: common.threads, device, ..RunOptions::default() };
     let scene_text = scene.to_toml()?;
     let setup = open(&scene)?;
+    if let Some(usage) = verifies_nothing(&setup, options.verify) {
+        bail!(usage);
+    }
     let scene_text = text_with_tau(&scene, &setup, scene_text)?;
     let bar = messages::progress(Some(100));
     let mut picture: Option<Frame> = None;

@@ -7,7 +7,7 @@ use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, op
 use super::{RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
-use crate::render::{Combine, Method, Renderer, Scene, TransferSettings};
+use crate::render::{Combine, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
 use crate::source::{
@@ -178,6 +178,7 @@ impl Setup {
             _ => return Err(no_domain()),
         };
         settle_method(&mut scene, &domain, &mut decisions)?;
+        notes.extend(unused_by_maps(&scene));
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
         }
@@ -229,8 +230,8 @@ fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Deci
     let is_flat = domain.dimensions == 2;
     if scene.render.method == Method::Default {
         let of_volumes = of_volumes(scene);
-        scene.render.method = scene.render.method.or_default(is_flat && of_volumes.is_none());
-        let why = match of_volumes {
+        scene.render.method = scene.render.method.or_default(is_flat && of_volumes.is_empty());
+        let why = match of_volumes.first() {
             _ if !is_flat => "the flow has three dimensions".to_owned(),
             None => "the flow has two dimensions; two_level draws it as a volume".to_owned(),
             Some(key) => format!("the scene sets {key}, which a map of the flow has not"),
@@ -244,8 +245,8 @@ fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Deci
     Ok(scene.render.check()?)
 }
 
-/// A key that only a picture of a volume has, if the scene sets one.
-fn of_volumes(scene: &Settings) -> Option<&'static str> {
+/// The keys of the scene that only a picture of a volume has.
+fn of_volumes(scene: &Settings) -> Vec<&'static str> {
     let transfer = scene.transfer.clone().unwrap_or_default();
     let has_albedo = transfer.albedo != TransferSettings::default().albedo;
     let set = [
@@ -260,7 +261,21 @@ fn of_volumes(scene: &Settings) -> Option<&'static str> {
         (scene.training != TrainingSettings::default(), "training"),
         (scene.trust != TrustSettings::default(), "trust"),
     ];
-    set.into_iter().find(|(is_set, _)| *is_set).map(|(_, key)| key)
+    set.into_iter().filter(|(is_set, _)| *is_set).map(|(_, key)| key).collect()
+}
+
+/// What is said of keys that a map ignores. They do not make the default method another one, if they are not of volumes alone.
+fn unused_by_maps(scene: &Settings) -> Option<String> {
+    let (render, default) = (&scene.render, RenderSettings::default());
+    if render.method != Method::Map {
+        return None;
+    }
+    let mut keys = of_volumes(scene);
+    // A map shows the part of the flow that the camera sees.
+    keys.retain(|key| *key != "camera");
+    keys.extend((render.tone_map != default.tone_map).then_some("render.tone_map"));
+    keys.extend((render.majorant_cells != default.majorant_cells).then_some("render.majorant_cells"));
+    (!keys.is_empty()).then(|| format!("without effect on a map: {}", keys.join(", ")))
 }
 
 /// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.

@@ -42,6 +42,27 @@ fn bad_usage_is_status_2() {
     refused(&["render", &config("saddle.toml"), "--out", "picture.tiff"], 2, &[".exr or .png"]);
 }
 
+#[test]
+fn options_without_effect_are_refused_or_told() {
+    let gyre = config("double_gyre.toml");
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("map.png");
+    for method in ["reference", "map"] {
+        let small = ["--method", method, "--set", "render.width=8", "--set", "render.height=4"];
+        let wanted = format!("--verify 100: method {method} has no surrogate");
+        refused(&[&["render", &gyre, "--verify", "100"], &small[..]].concat(), 2, &[&wanted, "two_level, marched"]);
+        refused(&[&["replay", &gyre, "--verify", "100"], &small[..]].concat(), 2, &[&wanted, "two_level, marched"]);
+    }
+    let base = ["render", &gyre, "--device", "cpu", "--method", "map", "--set", "render.width=8", "--set", "render.height=4"];
+    let keys = ["--set", "render.tone_map=[1,0.5,1]", "--set", "render.combine=\"sum\"", "--set", "trust.tolerance=0.2"];
+    let said = |keys: &[&str]| run(&mut program::ridgewatch([&base[..], keys, &["--out", text(&out)]].concat())).success().stderr;
+    let told = said(&keys);
+    assert!(told.contains("without effect on a map: light, transfer.extinction, render.combine, trust, render.tone_map"), "{told}");
+    // What the scene sets for its volume is told as well.
+    let told = said(&[]);
+    assert!(told.contains("without effect on a map: light, transfer.extinction\n"), "{told}");
+}
+
 /// A result that nobody got is no success, unlike one whose reader has left.
 #[test]
 fn a_result_that_cannot_be_written_is_an_error() {
