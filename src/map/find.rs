@@ -184,16 +184,16 @@ pub fn find(
         seconds: [seconds, start.elapsed().as_secs_f64() - seconds],
     };
     let about = SurfacesAbout { shared: about(moment, rate, level), time: moment.time, tau, direction: map.direction };
-    let notes = tracer.note.take().into_iter().chain(too_coarse(roughness)).collect();
+    let notes = tracer.note.take().into_iter().chain(too_coarse(roughness, "--grid")).collect();
     Ok(FoundRidges { ridges, about, record, notes })
 }
 
-/// What is said of a grid that does not resolve the FTLE.
-fn too_coarse(roughness: f64) -> Option<String> {
+/// What is said of a grid, of this option, that does not resolve the FTLE.
+pub(super) fn too_coarse(roughness: f64, option: &str) -> Option<String> {
     (roughness > ROUGH).then(|| {
         format!(
             "the grid is too coarse for this FTLE: from node to node it changes by {:.0} % of its spread, so that ridges are lost, torn or misplaced; take \
-             a finer --grid, or a shorter tau",
+             a finer {option}, or a shorter tau",
             100.0 * roughness
         )
     })

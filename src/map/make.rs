@@ -4,6 +4,7 @@ use super::arrows::{Arrows, arrows};
 use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
 use super::contour::contours;
 use super::draw::{MapFigure, Panel};
+use super::find::too_coarse;
 use super::footprint::{MapTracer, Raster, RasterError, Sampling};
 use super::graticule::axis_unit;
 use super::lines::{RidgeLine, RidgesAbout};
@@ -11,6 +12,7 @@ use super::projection::ProjectionKind;
 use super::record::{MapRecord, PanelRecord, RidgeRecord};
 use super::ridges::{Field, Strength};
 use super::sheet::Bar;
+use super::smoothing;
 use super::view::{View, is_geographic};
 use super::words::{Rate, date, duration, number};
 use super::{MapError, Moment};
@@ -70,6 +72,7 @@ struct Traced {
     steps: usize,
     difference: Option<f64>,
     ridges: Vec<RidgeLine>,
+    roughness: Option<f64>,
 }
 
 /// Makes the map of a moment. Calls `progress` with the seeds traced and those in all; once it returns false, the map is abandoned.
@@ -97,7 +100,8 @@ pub fn make(
     let nodes = options.ridges.map(|_| options.ridge_grid.unwrap_or_else(|| ridge_nodes(&view)));
     let mut notes = Vec::new();
     let each = (view.size[0] * view.size[1] * options.sampling.seeds + nodes.map_or(0, |[x, y]| x * y)) as u64;
-    let (mut done, total) = (0, each * (moment.taus.len() * directions.len()) as u64);
+    let panels = moment.taus.len() * directions.len();
+    let (mut done, total) = (0, each * panels as u64);
     let mut traced = Vec::new();
     for &tau in &moment.taus {
         for &direction in &directions {
@@ -111,19 +115,23 @@ pub fn make(
                 Raster::trace(&view, &mut tracer, options.sampling, &mut |pixels| count((pixels * options.sampling.seeds) as u64))
                     .map_err(RunError::of)?;
             let Some(raster) = traced_raster else { return Err(MapError::Stopped) };
-            let mut ridges = Vec::new();
+            let (mut ridges, mut roughness) = (Vec::new(), None);
             if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
                 let field = ridge_field(&view, &mut tracer, size, &mut |seeds| {
                     count(seeds as u64);
                 })?;
                 let kind = structures(direction);
+                let found = smoothing::roughness(&field.values, &size);
+                let panel = if panels > 1 { format!("{} FTLE, tau = {tau}: ", direction.name()) } else { String::new() };
+                notes.extend(too_coarse(found, "--ridge-grid").map(|text| panel + &text));
+                roughness = Some(found);
                 ridges = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
             }
             let flow = tracer.flow();
             let difference = flow.step_choice().map(|chosen| chosen.difference).filter(|d| d.is_finite());
             let steps = flow.steps();
             notes.extend(tracer.note.take());
-            traced.push(Traced { direction, tau, raster, steps, difference, ridges });
+            traced.push(Traced { direction, tau, raster, steps, difference, ridges, roughness });
         }
     }
     if traced.iter().all(|t| t.raster.mean.iter().all(|v| v.is_nan())) {
@@ -276,6 +284,7 @@ fn panel_record(traced: &Traced, options: &MapOptions, rate: &Rate, shown: [f64;
         missing_share: (0..raster.missing.len()).filter(|p| raster.is_land(*p)).count() as f64 / within.max(1) as f64,
         failed_seeds: raster.failed,
         ridge_lines: options.ridges.map(|_| traced.ridges.len()),
+        ridge_roughness: traced.roughness,
         colours: ramp(options.both, traced.direction).name(),
     }
 }

@@ -78,6 +78,8 @@ pub struct PanelRecord {
     pub failed_seeds: usize,
     /// Ridge lines; `None` without ridges.
     pub ridge_lines: Option<usize>,
+    /// Roughness of the field that ridges are found in, as in [`super::RidgesRecord`]; `None` without ridges.
+    pub ridge_roughness: Option<f64>,
     /// Colour map.
     pub colours: &'static str,
 }

@@ -94,6 +94,23 @@ fn land_is_grey_and_lines_reach_other_tools() {
 }
 
 #[test]
+fn a_ridge_grid_that_is_too_coarse_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("gyre.png");
+    let gyre = config("double_gyre.toml");
+    for (grid, is_told) in [("16x8", true), ("200x100", false)] {
+        let arguments = ["map", &gyre, "--device", "cpu", "--width", "64", "--seeds", "2", "--ridges", "--ridge-grid", grid];
+        let done = run(&mut ridgewatch([&arguments[..], &["--both", "--json", "--out", text(&out)]].concat())).success();
+        let panels = done.json()["panels"].clone();
+        for panel in panels.as_array().unwrap() {
+            assert_eq!(panel["ridge_roughness"].as_f64().unwrap() > 0.4, is_told, "{grid}: {panel}");
+        }
+        let told = done.stderr.matches("take a finer --ridge-grid").count();
+        assert_eq!((told, done.stderr.contains("backward FTLE, tau = ")), (if is_told { 2 } else { 0 }, is_told), "{}", done.stderr);
+    }
+}
+
+#[test]
 fn both_directions_and_several_taus_share_a_picture() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("gyre.svg");
