@@ -74,7 +74,8 @@ fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
     let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
     let seeds: Vec<DomainPoint> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
-    let TracedOnce { flow, traced, .. } = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).unwrap();
+    let TracedOnce { flow, traced, .. } =
+        device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds, &AtomicBool::new(false)).unwrap();
     let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
     TransferSettings::default().scaled_to(&ftle)
 }

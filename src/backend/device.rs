@@ -5,12 +5,13 @@ use super::cuda::{CudaTracer, Gpu, GpuSettings, SnapshotStore, Tuning};
 use super::settings::{DeviceChoice, DeviceSettings};
 #[cfg(feature = "cuda")]
 use super::settings::{Storage, WhenLost};
-use super::{BackendError, DeviceError};
+use super::{BackendError, DeviceError, Interruptible};
 use ridgewatch_field::DomainPoint;
 use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_surrogate::Trace;
 #[cfg(feature = "cuda")]
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// The selected device.
@@ -129,11 +130,18 @@ impl Device {
     }
 
     /// Traces one set of seeds at the start time `t0`. If the device cannot and the settings allow the CPU to take over, the CPU
-    /// traces them and a note says why.
+    /// traces them and a note says why. Setting `stop` ends the work early; the results of the seeds that are left are then NaN.
     ///
     /// # Errors
     /// The flow map is invalid, or the device fails and the settings do not allow the CPU to take over.
-    pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Result<TracedOnce, BackendError> {
+    pub fn trace(
+        &self,
+        velocity: &VelocitySource,
+        map: &FlowMap,
+        t0: f64,
+        seeds: &[DomainPoint],
+        stop: &AtomicBool,
+    ) -> Result<TracedOnce, BackendError> {
         let mut traced = Traced::default();
         #[cfg_attr(not(feature = "cuda"), allow(unused_mut))] // no other device fails
         let mut note = None;
@@ -145,7 +153,8 @@ impl Device {
                 let tuning = Tuning { storage: *storage, ..Tuning::default() };
                 let tracer = CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning);
                 begun = Instant::now();
-                match tracer.and_then(|tracer| Ok(tracer.trace(seeds, Extras::default(), &mut traced).map(|()| tracer)?)) {
+                let mut trace = |tracer: &CudaTracer| Interruptible::new(tracer, stop).trace(seeds, Extras::default(), &mut traced);
+                match tracer.and_then(|tracer| Ok(trace(&tracer).map(|()| tracer)?)) {
                     Ok(tracer) => return Ok(TracedOnce { flow: tracer.into_host(), traced, seconds: begun.elapsed().as_secs_f64(), note }),
                     Err(BackendError::Device(error)) if self.may_fall_back(&error) => {
                         note = Some(format!("traced on the CPU: {error}"));
@@ -156,7 +165,7 @@ impl Device {
         }
         let flow = cpu_tracer(velocity.clone(), map, t0)?;
         begun = begun.max(Instant::now());
-        Tracer::trace(&*flow, seeds, Extras::default(), &mut traced);
+        Interruptible::new(&flow, stop).trace(seeds, Extras::default(), &mut traced)?;
         Ok(TracedOnce { flow, traced, seconds: begun.elapsed().as_secs_f64(), note })
     }
 }

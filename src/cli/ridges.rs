@@ -113,6 +113,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let found = map::find(&moment, options.grid.as_ref().map(|grid| &grid.0[..]), &strength, &device, &mut |done, total| {
         bar.set_length(total);
         bar.set_position(done);
+        if done == total {
+            bar.set_message("traced");
+        }
     })
     .map_err(|error| explained(&scene, error))?;
     bar.finish_and_clear();

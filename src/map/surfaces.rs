@@ -9,7 +9,9 @@
 use super::pieces::pieces;
 use super::ridges::{Strength, cubic_zero, least_sharpness, percentile};
 use super::volume::{Shape, Shapes, Volume};
+use crate::progress::Work;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// A vertex of a ridge surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -112,7 +114,13 @@ impl Volume {
     fn mesh(&self, shapes: &Shapes, faint: f64) -> Mesh {
         let layers: Vec<usize> = (0..self.size[2] - 1).collect();
         let at_once = layers.len().div_ceil(4 * rayon::current_num_threads()).max(4);
-        let slabs: Vec<Slab> = layers.par_chunks(at_once).map(|layers| self.slab(layers, shapes, faint)).collect();
+        let (work, done) = (Work::begin("finding ridges"), AtomicUsize::new(0));
+        let slab = |some: &[usize]| {
+            let slab = self.slab(some, shapes, faint);
+            work.reached(done.fetch_add(some.len(), Ordering::Relaxed) + some.len(), layers.len());
+            slab
+        };
+        let slabs: Vec<Slab> = layers.par_chunks(at_once).map(slab).collect();
         slabs.into_iter().fold(Mesh::default(), Mesh::and)
     }
 

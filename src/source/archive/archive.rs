@@ -20,6 +20,7 @@ use crate::grids::{
 };
 use crate::ground::GroundToGrid;
 use crate::snapshots::{News, SnapshotSource, SourceDescription, TimeGap, time_gaps};
+use ridgewatch_base::progress::Work;
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -145,7 +146,11 @@ impl Archive {
         let mut georeference = Georeference::default();
         let (mut ground_to_grid, mut ground_note) = (None, None);
         let mut masks: Vec<Group> = Vec::new();
-        for group in groups {
+        let count = groups.len();
+        // The header of one file may take long too, and tells of itself.
+        let work = (count > 1).then(|| Work::begin("opening the files"));
+        for (number, group) in groups.into_iter().enumerate() {
+            work.iter().for_each(|work| work.reached(number, count));
             let Some(path) = group.first().cloned() else { continue };
             let stamps = stamps(&group);
             let (file, layout) = match open_next(&group, settings, first.as_ref(), expected.as_ref(), limits) {

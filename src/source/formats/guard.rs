@@ -126,6 +126,15 @@ static OPENED: Mutex<String> = Mutex::new(String::new());
 /// Seconds that a library may take to open a file: some damaged files put it into an endless loop.
 const MAX_OPENING: u64 = 120;
 
+/// Begins the time limit of an opening anew. For readers that come to an end with the file, however long it is.
+pub fn more_is_read() {
+    if let Some(start) = START.get()
+        && OPENING.load(Ordering::Relaxed) > 0
+    {
+        OPENING.store(start.elapsed().as_millis() as u64 + 1, Ordering::Relaxed);
+    }
+}
+
 /// Attributes crashes on this thread to a file while it lives.
 struct Reading {
     _name: CString,

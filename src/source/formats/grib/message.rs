@@ -1,11 +1,13 @@
 //! One field of a message: what it is of, and where its values lie.
 
+use super::super::guard::more_is_read;
 use super::super::limits::Limits;
 use super::super::messages::FormatFault;
 use super::grid::Grid;
 use super::input::Input;
 use super::names::{Levels, Parameter};
 use super::{edition1, edition2};
+use ridgewatch_base::progress::Work;
 
 /// Most fields of a file.
 const MAX_FIELDS: usize = 1 << 20;
@@ -76,7 +78,10 @@ impl Message {
     pub fn all(input: &mut Input<'_>, limits: &Limits) -> Result<Vec<Self>, FormatFault> {
         let mut all: Vec<Self> = Vec::new();
         let mut at = 0;
+        let work = Work::begin("reading headers");
         while let Some(begin) = input.message(at)? {
+            work.reached(begin as usize, input.length as usize);
+            more_is_read();
             let head = input.bytes::<8>(begin)?;
             at = match head[7] {
                 1 => edition1::read(input, begin, &mut all, limits)?,
