@@ -61,11 +61,7 @@ impl Trace for Interruptible<'_> {
                 self.tracer.trace(part, extras, out)?;
             } else {
                 self.tracer.trace(part, extras, &mut piece)?;
-                out.log_stretch.append(&mut piece.log_stretch);
-                out.log_stretch_f64.append(&mut piece.log_stretch_f64);
-                out.lifetime_share.append(&mut piece.lifetime_share);
-                out.arrival.append(&mut piece.arrival);
-                out.jacobian.append(&mut piece.jacobian);
+                out.append(&mut piece);
             }
             done += part.len();
             self.measured(part.len(), start.elapsed().as_secs_f64());

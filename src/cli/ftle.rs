@@ -4,10 +4,10 @@ use super::common::{Common, Usage, check_folder, chosen_steps, device, dimension
 use super::messages;
 use anyhow::{Result, bail};
 use ridgewatch::backend::{Device, TracedOnce};
+use ridgewatch::field::DomainPoint;
 use ridgewatch::field::analytic::Analytic;
-use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
-use ridgewatch::publish::{Field, FieldExport, FieldFormat, FieldFrame};
+use ridgewatch::publish::{FieldExport, FieldFormat, FieldFrame, SeedField, seeds};
 use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
 use ridgewatch::source::utc;
@@ -242,49 +242,39 @@ fn compute(
     let seeds = seeds(&plan.domain, grid);
     bar.set_message(format!("tracing {} seeds", seeds.len()));
     let TracedOnce { flow: tracer, traced, seconds, note } =
-        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(RunError::of)?;
+        device.trace(&slide.velocity, &plan.map, slide.time, &seeds, &AtomicBool::new(false)).map_err(RunError::of)?;
     note.into_iter().for_each(|note| bar.suspend(|| messages::note(note)));
-    let tau = tracer.tau();
-    let without: Vec<bool> = seeds.iter().map(|seed| tracer.is_missing(*seed)).collect();
-    let ftle: Vec<f64> = unrounded(&traced).iter().zip(&without).map(|(s, &missing)| if missing { f64::NAN } else { s / tau }).collect();
-    let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
-    let missing = without.iter().filter(|missing| **missing).count();
+    let found = SeedField::new(&*tracer, &seeds, traced);
+    let known: Vec<f64> = found.ftle.iter().copied().filter(|f| f.is_finite()).collect();
+    let missing = found.missing.iter().filter(|missing| **missing).count();
     if options.check || options.convergence {
         bar.set_message(format!("integrating {} seeds for comparison", seeds.len()));
     }
     let truth = if options.check { Some(truth(plan, slide, &seeds)?) } else { None };
-    let check = truth.as_ref().map(|truth| check(truth, &*tracer, &seeds, &ftle)).transpose()?;
+    let check = truth.as_ref().map(|truth| check(truth, &*tracer, &seeds, &found.ftle)).transpose()?;
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
     if let Some(out) = &options.out {
         let export = match export {
             Some(export) => export,
             None => {
-                let integrator = format!("{}, {}", word(plan.map.integrator), word(plan.map.precision));
-                let frame = FieldFrame::new(plan, slide, grid, integrator, history(), truth.as_ref().map(|(name, _)| *name));
+                let frame = FieldFrame::new(plan, slide, grid, history(), truth.as_ref().map(|(name, _)| *name));
                 let format = options.format.unwrap_or_else(|| FieldFormat::of(out));
                 export.insert(FieldExport::create(out, format, frame, options.slides.is_some())?)
             }
         };
-        let error: Option<Vec<f64>> = truth.as_ref().map(|(_, truth)| ftle.iter().zip(truth).map(|(a, b)| (a - b).abs()).collect());
-        export.add(&Field {
-            time: slide.time,
-            ftle: &ftle,
-            lifetime_share: &traced.lifetime_share,
-            missing: &without,
-            error: error.as_deref(),
-            error_of_steps: difference_of_steps(&*tracer).map(|difference| difference / tau),
-            steps: tracer.steps(),
-        })?;
+        let differences = |truth: &Vec<f64>| found.ftle.iter().zip(truth).map(|(a, b)| (a - b).abs()).collect();
+        let error: Option<Vec<f64>> = truth.as_ref().map(|(_, truth)| differences(truth));
+        export.add(&found.field(error.as_deref()))?;
     }
     Ok(Report {
         time: slide.time,
         date: slide.date.clone(),
-        tau,
+        tau: tracer.tau(),
         grid,
         integrator: plan.map.integrator,
         precision: plan.map.precision,
         steps: tracer.steps(),
-        integration_difference: difference_of_steps(&*tracer),
+        integration_difference: found.difference_of_steps,
         time_unit: plan.time_unit.clone(),
         source: plan.source.clone(),
         minimum: known.iter().copied().fold(f64::INFINITY, f64::min),
@@ -292,7 +282,8 @@ fn compute(
         maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
         missing_seeds: missing,
         failed_seeds: seeds.len() - missing - known.len(),
-        stopped_early_share: traced.lifetime_share.iter().zip(&ftle).filter(|(share, ftle)| **share < 1.0 && !ftle.is_nan()).count() as f64
+        stopped_early_share: found.lifetime_share.iter().zip(&found.ftle).filter(|(share, ftle)| **share < 1.0 && !ftle.is_nan()).count()
+            as f64
             / seeds.len() as f64,
         seconds,
         samples_per_second: seeds.len() as f64 / seconds,
@@ -300,16 +291,6 @@ fn compute(
         convergence,
         file: None,
     })
-}
-
-/// Difference of the log-stretch from twice as many steps. `None` if the steps were given.
-fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
-    tracer.step_choice().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
-}
-
-fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<DomainPoint> {
-    let at = |i: usize, n: usize| if n > 1 { i as f32 / (n - 1) as f32 } else { 0.5 };
-    (0..nx * ny * nz).map(|i| domain.from_unit(UnitPoint([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)]))).collect()
 }
 
 /// FTLE of a flow whose FTLE is uniform and known. `None` for other flows.
@@ -329,15 +310,6 @@ fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
     }
 }
 
-/// Log-stretch in the precision of its integration.
-fn unrounded(traced: &Traced) -> Vec<f64> {
-    if traced.log_stretch_f64.is_empty() {
-        traced.log_stretch.iter().map(|s| f64::from(*s)).collect()
-    } else {
-        traced.log_stretch_f64.clone()
-    }
-}
-
 /// FTLE at the seeds that counts as the truth, with its name.
 fn truth(plan: &Plan, slide: &Slide, seeds: &[DomainPoint]) -> Result<(&'static str, Vec<f64>)> {
     if let Some(value) = closed_form(plan, &slide.velocity) {
@@ -351,7 +323,7 @@ fn ftle(map: &FlowMap, slide: &Slide, seeds: &[DomainPoint]) -> Result<Vec<f64>>
     let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
     let mut traced = Traced::default();
     tracer.trace(seeds, Extras::default(), &mut traced);
-    Ok(unrounded(&traced).iter().map(|s| s / map.tau).collect())
+    Ok(traced.unrounded().iter().map(|s| s / map.tau).collect())
 }
 
 fn check((name, truth): &(&'static str, Vec<f64>), tracer: &dyn Tracer, seeds: &[DomainPoint], ftle: &[f64]) -> Result<Check> {

@@ -2,7 +2,7 @@
 
 use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
-    text_with_tau,
+    text_with_tau, verifies_nothing,
 };
 use super::signals::Stop;
 use super::{dashboard, messages, notify};
@@ -10,8 +10,8 @@ use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::map::{MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
-    DEFAULT_ENDPOINT, FileStatistics, MapAbout, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder,
-    Summary, WhenDiskSlow,
+    DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
+    WhenDiskSlow,
 };
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
@@ -145,6 +145,12 @@ impl Session<'_> {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
+        match verifies_nothing(&setup, options.verify) {
+            // The simulation does not come again.
+            Some(usage) if follows => messages::note(usage),
+            Some(usage) => bail!(usage),
+            None => {}
+        }
         let text = text_with_tau(&scene, &setup, text)?;
         let device = device(common, &scene)?;
         if let Some(checkpoint) = &options.checkpoint {
@@ -183,16 +189,15 @@ impl Session<'_> {
         if let Some(commands) = &commands {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
-        let newest = Arc::new(NewestFrame::new(&out, MapAbout::new(&setup.plan)));
+        let newest = Arc::new(NewestFrame::of_run(&out, &setup.plan));
         let shown = options.dashboard.zip(output.endpoint());
         let dashboard = shown.and_then(|(port, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
             let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());
             dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest), chart)
         });
-        if dashboard.is_some() {
-            output.keep_newest(newest);
-        }
+        let newest = Some(newest).filter(|_| dashboard.is_some());
+        newest.iter().for_each(|newest| output.keep_newest(Arc::clone(newest)));
         let run_options = RunOptions {
             verify_points: options.verify as usize,
             seconds: options.seconds,
@@ -205,7 +210,7 @@ impl Session<'_> {
             abandon: stop.abandoned.clone(),
         };
         let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| !follows && publish.maps);
-        let (result, last, summary) = work(setup, &scene, &run_options, output, maps, &stop.requested);
+        let (result, last, summary) = work(setup, &scene, &run_options, output, newest, maps, &stop.requested);
         let report = result?;
         for warning in &report.warnings {
             messages::note(format_args!("after the last frame: {warning}"));
@@ -296,6 +301,7 @@ fn work(
     scene: &SceneFile,
     options: &RunOptions,
     mut output: Output,
+    newest: Option<Arc<NewestFrame>>,
     mut maps: Option<SlideMaps>,
     stop: &AtomicBool,
 ) -> (Result<RunReport>, Option<Arc<FrameRecord>>, Summary) {
@@ -304,8 +310,9 @@ fn work(
     let mut last: Option<Arc<FrameRecord>> = None;
     let mut sink = |event| match event {
         Event::Slide(shown) => {
+            newest.iter().filter_map(|newest| newest.slide()).for_each(|newest| newest.put(&shown));
             // A signal ends the run soon.
-            if let Some(drawing) = maps.as_mut().filter(|_| !stop.load(Ordering::Relaxed)) {
+            if let Some(drawing) = maps.as_mut().filter(|_| shown.is_new && !stop.load(Ordering::Relaxed)) {
                 bar.set_message(format!("map of slide {}", shown.slide.index));
                 match drawing.draw(*shown, stop) {
                     Ok((map, notes)) => {

@@ -9,6 +9,7 @@
 mod access;
 mod client;
 mod error;
+mod field;
 mod files;
 mod hub;
 mod metrics;

@@ -1,8 +1,9 @@
 //! Pixels of the newest frame of the run in this process, and that frame as a file.
 
 use super::access::parameter;
+use super::field::Fields;
 use super::planes::MAX_PLANES;
-use crate::publish::{NewestFrame, NoFrame, NoMapField, channels_at, encode_exr, no_error, png};
+use crate::publish::{NewestFrame, NoField, NoFrame, channels_at, encode_exr, no_error, png};
 use crate::run::Frame;
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -20,7 +21,7 @@ const MAX_DOWNLOADS: usize = 1;
 /// Lossless pictures on their way at once, most of them the same one.
 const MAX_PICTURES: usize = 64;
 
-const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
+pub(super) const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
 
 /// What is served of the pixels, as a page is told.
 #[derive(Debug, Serialize)]
@@ -35,12 +36,13 @@ pub(super) enum Kept<'a> {
 /// Serves the newest frame, if it is in this process.
 #[derive(Debug)]
 pub(super) struct Pixels {
-    newest: Option<Arc<NewestFrame>>,
-    downloads: Arc<Semaphore>,
+    pub(super) newest: Option<Arc<NewestFrame>>,
+    pub(super) downloads: Arc<Semaphore>,
     /// The latest picture that was encoded without loss, for all pages that ask for it.
     lossless: Mutex<Option<(u64, Bytes)>>,
     pictures: Arc<Semaphore>,
     pub(super) planes: Arc<Semaphore>,
+    pub(super) fields: Arc<Fields>,
 }
 
 /// A file that a frame is sent as.
@@ -96,10 +98,7 @@ impl File {
             Self::Exr => encode_exr(&frame.film, Some(&frame.record)).map_err(system),
             Self::Png => png(&frame.film, frame.tone_map).map_err(|error| system(error.to_string())),
             Self::Record => serde_json::to_vec_pretty(&*frame.record).map_err(|error| system(error.to_string())),
-            Self::NetCdf => newest.netcdf(frame).map_err(|error| match error {
-                NoMapField::NoField(why) => (StatusCode::NOT_FOUND, why),
-                NoMapField::System(error) => system(error),
-            }),
+            Self::NetCdf => newest.netcdf(frame).map_err(no_field),
         }
     }
 }
@@ -107,7 +106,7 @@ impl File {
 impl Pixels {
     pub fn new(newest: Option<Arc<NewestFrame>>) -> Self {
         let [downloads, pictures, planes] = [MAX_DOWNLOADS, MAX_PICTURES, MAX_PLANES].map(|most| Arc::new(Semaphore::new(most)));
-        Self { newest, downloads, lossless: Mutex::default(), pictures, planes }
+        Self { newest, downloads, lossless: Mutex::default(), pictures, planes, fields: Arc::default() }
     }
 
     pub fn kept(&self) -> Kept<'_> {
@@ -220,6 +219,14 @@ impl Pixels {
     }
 }
 
+pub(super) fn no_field(error: NoField) -> Refusal {
+    match error {
+        NoField::Missing(why) => (StatusCode::NOT_FOUND, why),
+        NoField::Gone(why) => (StatusCode::GONE, why),
+        NoField::System(error) => (StatusCode::INTERNAL_SERVER_ERROR, error),
+    }
+}
+
 pub(super) fn refused((status, words): Refusal) -> Response {
     (status, words + "\n").into_response()
 }
@@ -229,6 +236,6 @@ pub(super) fn bad(name: &str, found: &str, accepted: &str) -> Refusal {
     (StatusCode::BAD_REQUEST, format!("`{name}` is \"{found}\"; accepted: {accepted}"))
 }
 
-fn whole(name: &str, text: &str, accepted: &str) -> Result<u64, Refusal> {
+pub(super) fn whole(name: &str, text: &str, accepted: &str) -> Result<u64, Refusal> {
     text.parse().map_err(|_| bad(name, text, accepted))
 }

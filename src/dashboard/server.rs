@@ -1,6 +1,6 @@
 //! HTTP: the page, its files, and the WebSocket.
 
-use super::access::{Access, Refused, given_token};
+use super::access::{Access, Refused, Rights, given_token};
 use super::hub::Hub;
 use super::pixels::File;
 use super::{client, files, metrics};
@@ -43,6 +43,7 @@ const PAUSE: Duration = Duration::from_millis(100);
 /// Scripts, styles and connections of this server alone; `ws:` since some browsers do not count a WebSocket as `'self'`.
 const POLICY: &str = "default-src 'self'; img-src 'self' blob:; connect-src 'self' ws: wss:; style-src 'self'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'self'";
+const NO_FIELD: Refused = "This token only watches: it has no field traced.\n";
 /// In every answer.
 const HEADERS: [(HeaderName, HeaderValue); 4] = [
     (CACHE_CONTROL, HeaderValue::from_static("no-store")),
@@ -78,9 +79,9 @@ async fn connection(stream: TcpStream, access: &Access, hub: &Arc<Hub>, download
     // Small messages follow large ones.
     let _ = stream.set_nodelay(true);
     let service = service_fn(|request: hyper::Request<hyper::body::Incoming>| async {
-        let is_file = File::named(request.uri().path()).is_some();
+        let is_file = matches!(OfFrames::named(request.uri().path()), Some(OfFrames::File(_) | OfFrames::Field));
         let response = answer(request.map(Body::new), access, Arc::clone(hub)).await;
-        if is_file && response.status().is_success() {
+        if is_file && response.status() == StatusCode::OK {
             downloads.store(true, Ordering::Relaxed);
         }
         Ok::<_, Infallible>(response)
@@ -114,6 +115,7 @@ enum OfFrames {
     Plane,
     Histogram,
     Values,
+    Field,
 }
 
 impl OfFrames {
@@ -122,6 +124,7 @@ impl OfFrames {
             Some("plane") => Some(Self::Plane),
             Some("histogram") => Some(Self::Histogram),
             Some("values") => Some(Self::Values),
+            Some("field.nc") => Some(Self::Field),
             _ => File::named(path).map(Self::File),
         }
     }
@@ -172,8 +175,11 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
     }
     if let Some(wanted) = OfFrames::named(path) {
         access.check_origin(&parts.headers)?;
-        access.check_token(&parts.uri)?;
+        let rights = access.check_token(&parts.uri)?;
         return Ok(match wanted {
+            // It takes processors from the run.
+            OfFrames::Field if rights != Rights::Steer => return Err(NO_FIELD),
+            OfFrames::Field => hub.pixels.field(&parts.uri),
             OfFrames::File(file) => hub.pixels.download(file, &parts.uri).await,
             OfFrames::Plane => hub.pixels.plane(&parts.uri).await,
             OfFrames::Histogram => hub.pixels.histogram(&parts.uri),

@@ -224,6 +224,24 @@ pub struct Traced {
 }
 
 impl Traced {
+    /// Appends the seeds of `other`, which holds the same kinds of results, and leaves it empty.
+    pub fn append(&mut self, other: &mut Self) {
+        self.log_stretch.append(&mut other.log_stretch);
+        self.log_stretch_f64.append(&mut other.log_stretch_f64);
+        self.lifetime_share.append(&mut other.lifetime_share);
+        self.arrival.append(&mut other.arrival);
+        self.jacobian.append(&mut other.jacobian);
+    }
+
+    /// The log-stretch in the precision of its integration.
+    pub fn unrounded(&self) -> Vec<f64> {
+        if self.log_stretch_f64.is_empty() {
+            self.log_stretch.iter().map(|s| f64::from(*s)).collect()
+        } else {
+            self.log_stretch_f64.clone()
+        }
+    }
+
     /// Resizes all arrays to `count` seeds; new entries are NaN, with a lifetime of 0. `double`: also those in double precision.
     pub fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
         let wanted = |yes: bool| if yes { count } else { 0 };

@@ -37,7 +37,7 @@ impl SlideMaps {
     /// # Errors
     /// No map shows the domain, no pixel has a velocity, or the device fails; [`MapError::Stopped`] soon after `stop` is set.
     pub fn draw(&mut self, shown: ShownSlide, stop: &AtomicBool) -> Result<(SlideMap, Vec<String>), MapError> {
-        let ShownSlide { slide, map } = shown;
+        let ShownSlide { slide, map, .. } = shown;
         let (tau, direction) = (map.tau, map.direction);
         self.plan.map = map;
         let scene = &self.plan.scene;

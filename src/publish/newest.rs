@@ -1,7 +1,7 @@
-//! The newest frame of a run in memory, for those who ask about its pixels or want it as a file.
+//! The newest frame of a run in memory, and its slide, for those who ask about its pixels or want it as a file.
 
-use super::export::{MapAbout, NoMapField, map_netcdf};
-use crate::run::Frame;
+use super::export::{MapAbout, NewestSlide, NoField, map_netcdf};
+use crate::run::{Frame, Plan};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
@@ -11,6 +11,8 @@ pub struct NewestFrame {
     run: String,
     about: MapAbout,
     frame: Mutex<Option<Frame>>,
+    /// `None` if no slides are kept.
+    slide: Option<NewestSlide>,
 }
 
 /// Why a frame is not there.
@@ -28,12 +30,17 @@ pub enum NoFrame {
 }
 
 impl NewestFrame {
-    /// Of the run that writes into this folder, whose name goes into the names of files.
+    /// Of a run that writes into this folder, whose name goes into the names of files. Keeps its slides as well.
+    pub fn of_run(folder: &Path, plan: &Plan) -> Self {
+        Self { slide: Some(NewestSlide::new(plan)), ..Self::new(folder, MapAbout::new(plan)) }
+    }
+
+    /// The same of frames alone.
     pub fn new(folder: &Path, about: MapAbout) -> Self {
         let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         // What every file system and a quoted string of HTTP accept.
         let run: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
-        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about, frame: Mutex::default() }
+        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about, frame: Mutex::default(), slide: None }
     }
 
     /// Name of the run in names of files: letters, digits, `-`, `_` and `.`.
@@ -45,8 +52,13 @@ impl NewestFrame {
     ///
     /// # Errors
     /// Why it is no such field, or what the system refuses.
-    pub fn netcdf(&self, frame: &Frame) -> Result<Vec<u8>, NoMapField> {
+    pub fn netcdf(&self, frame: &Frame) -> Result<Vec<u8>, NoField> {
         map_netcdf(frame, &self.about, &self.run)
+    }
+
+    /// The slide of the newest frame; `None` if no slides are kept.
+    pub fn slide(&self) -> Option<&NewestSlide> {
+        self.slide.as_ref()
     }
 
     /// Keeps this frame in place of the one before.

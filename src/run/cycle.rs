@@ -73,7 +73,7 @@ pub enum Event {
     Frame(Frame),
     /// Share of the current frame that is rendered.
     Progress(f32),
-    /// After the first frame of a slide: what was traced for it.
+    /// After the first frame of a slide, and of another flow map: what was traced for it.
     Slide(Box<ShownSlide>),
 }
 
@@ -83,6 +83,10 @@ pub struct ShownSlide {
     pub slide: Slide,
     /// The flow map of its frame, with the steps that were chosen.
     pub map: FlowMap,
+    /// The flow map as the scene and commands ask for it, with the rule for its steps.
+    pub asked: FlowMap,
+    /// True after the slide's first frame.
+    pub is_new: bool,
 }
 
 /// Summary of a run.
@@ -742,8 +746,9 @@ impl<B: Backend> Cycle<'_, B> {
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
-            if number == 0 {
-                sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map: self.map.clone() })));
+            if number == 0 || commands == Commands::Map {
+                let (map, asked) = (self.map.clone(), self.run.asked.clone());
+                sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map, asked, is_new: number == 0 })));
             }
             number += 1;
             since_command = since_command.map(|frames: usize| frames + 1);

@@ -1,6 +1,6 @@
 //! Values of pixels and downloads: those of the frame's EXR, and why there are none.
 
-use crate::kit::program::{Running, ridgewatch, set, start, text, until};
+use crate::kit::program::{Running, ridgewatch, run, set, start, text, until};
 use crate::kit::publishing;
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, ask, get};
@@ -209,6 +209,11 @@ fn frames_go_to_those_who_know_a_token() {
     let (stage, _newest) = stage(Some(map_frame(1, [8, 4], above(1.0, 0.5, 1.0))));
     let address = stage.address();
     let watching = stage.dashboard.watching_url().split("token=").nth(1).unwrap().to_owned();
+    // A field takes processors from the run, and this stage has none.
+    for (token, status, words) in [(&watching, 403, "only watches"), (&stage.token, 404, ""), (&String::new(), 403, "token")] {
+        let (found, answer) = get(address, &format!("/field.nc?token={token}"), &[]);
+        assert!(found == status && answer.contains(words), "{answer}");
+    }
     for target in ["/values?x=0&y=0&", "/plane?of=ftle&", "/histogram?", "/frame.exr?", "/frame.png?", "/frame.json?", "/frame.nc?"] {
         assert_eq!(get(address, &format!("{target}token={watching}"), &[]).0, 200, "{target}");
         assert_eq!(get(address, &format!("{target}token={}", stage.token), &[]).0, 200, "{target}");
@@ -307,5 +312,58 @@ fn a_run_tells_the_values_of_the_exr_that_it_writes() {
         assert!(values["channels"]["error"].as_f64().unwrap() > 0.0, "{values}");
         let film = read_exr(&run.join(format!("frames/frame_{:06}.exr", values["frame"].as_u64().unwrap()))).unwrap();
         agrees(&values, &film);
+    }
+}
+
+/// The field that a run traces beside itself is that of `ftle`.
+#[test]
+fn a_run_traces_the_field_of_its_slide() {
+    let folder = tempfile::tempdir().unwrap();
+    // Longer than the test, so that the slide stays.
+    let lines = "time.tau = 2\ntime.frames_per_slide = 100000\nrender.method = \"two_level\"\nsurrogate.kind = \"table\"\n";
+    let scene = scene::write(folder.path(), &double_gyre([16, 8, 1], lines));
+    let endpoint = format!("ipc://{}", folder.path().join("frames").display());
+    let mut replay = ridgewatch(["replay", &scene, "--json", "--out", text(&folder.path().join("gyre")), "--dashboard=0"]);
+    let running = start(replay.args(["--publish", &endpoint]));
+    let (address, token) = url(&running);
+    let asked = |query: &str| bytes(address, &format!("/field.nc?{query}token={token}"));
+    let (head, why) = asked("slide=0&");
+    assert!(
+        head.starts_with("HTTP/1.1 202") || (head.starts_with("HTTP/1.1 404") && why.starts_with(b"no frame is complete yet")),
+        "{head}"
+    );
+    Visitor::open(address, &token).frame();
+    let mut state = Vec::new();
+    let (head, found) = loop {
+        let (head, found) = asked("slide=0&");
+        if !head.starts_with("HTTP/1.1 202") && !head.starts_with("HTTP/1.1 404") {
+            break (head, found);
+        }
+        state.push(serde_json::from_slice::<Value>(&found).ok());
+        // A second page is told of the first one's.
+        let (_, other) = asked("slide=7&");
+        let other = String::from_utf8_lossy(&other).into_owned();
+        let is_told =
+            ["the field of slide 0 is being traced", "slide 7 is no longer kept: the run shows slide 0", "no frame is complete yet"];
+        assert!(is_told.iter().any(|words| other.contains(words)), "{other}");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    };
+    assert!(
+        head.starts_with("HTTP/1.1 200") && head.contains("filename=\"gyre-field-slide-0000.nc\""),
+        "{head} {:?}",
+        String::from_utf8(found)
+    );
+    let shares: Vec<f64> = state.iter().flatten().map(|state| state["share"].as_f64().unwrap()).collect();
+    assert!(!shares.is_empty() && shares.is_sorted() && shares.iter().all(|share| (0.0..=1.0).contains(share)), "{state:?}");
+    running.signal(libc::SIGTERM);
+    running.wait();
+    let [own, wanted] = ["own.nc", "wanted.nc"].map(|name| folder.path().join(name));
+    std::fs::write(&own, found).unwrap();
+    let values = |file: &Path, name: &str| netcdf::open(file).unwrap().variable(name).unwrap().get_values::<f64, _>(..).unwrap();
+    let grid = format!("{}x{}", values(&own, "x").len(), values(&own, "y").len());
+    assert_eq!(grid, "1024x512", "half a million seeds");
+    run(&mut ridgewatch(["ftle", &scene, "--device", "cpu", "--grid", &grid, "--out", text(&wanted)])).success();
+    for name in ["x", "y", "time", "time_bounds", "ftle", "lifetime", "ftle_error_of_steps", "integration_steps"] {
+        assert_eq!(values(&own, name), values(&wanted, name), "{name}");
     }
 }

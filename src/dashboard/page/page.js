@@ -10,7 +10,7 @@ import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms } from "./terms.js";
-import { Values, address as fileAddress, asker, download, fieldCommand, histogramAsker, pictureAsker, pixelAt, planeAsker } from "./values.js";
+import { Values, address as fileAddress, asker, download, downloadField, fieldCommand, histogramAsker, pictureAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
@@ -290,9 +290,13 @@ async function save(ending) {
   if (told !== null) warnings.hold("download", told, picture.shown.frame);
 }
 
-/** Saves the pixels of a map; of other frames shows and copies the command for the field of the slide, or hides it again. */
+// Ends the tracing of a field.
+let fieldEnd = null;
+
+/** Saves the pixels of a map; of other frames the field of the slide, which is traced first, and shows the command for it. A second click ends both. */
 async function showField() {
   const [told, { record }] = [element("field-told"), picture.shown.header];
+  fieldEnd?.abort();
   if (record?.method === "map" && told.hidden) {
     const problem = await download("nc", { token, kept: values.kept, shown: picture.shown, held: picture.held });
     if (problem === null) return;
@@ -302,10 +306,19 @@ async function showField() {
   element("field").setAttribute("aria-expanded", String(!told.hidden));
   if (told.hidden) return;
   const { words, command } = fieldCommand(values.kept?.ready ?? "run", server?.endpoint, record);
-  setText(told.firstChild, words);
-  setText(told.lastChild, command ?? "");
-  // Where the page may not copy, a click selects all of it.
-  if (command) await navigator.clipboard?.writeText(command).catch(() => {});
+  setText(element("field-words"), words);
+  setText(element("field-command"), command ?? "");
+  fieldEnd = new AbortController();
+  const { signal } = fieldEnd;
+  const tell = (text) => { if (!signal.aborted) setText(element("field-state"), text); };
+  tell("");
+  if (record.method === "map" || values.kept?.ready === undefined) return;
+  try {
+    const name = await downloadField({ token, slide: picture.held ? record.slide : null, tell, signal });
+    tell(`Saved: ${name}.`);
+  } catch (error) {
+    tell(`No field from the run: ${error.message}.`);
+  }
 }
 
 async function share() {

@@ -1,11 +1,13 @@
 // What the run knows of the pixel under the pointer, and its newest frame as a file.
-import { count, number, withUnit } from "./words.js";
+import { count, duration, number, percent, withUnit } from "./words.js";
 
 // Between two questions, so that a pointer on its way asks little.
 const SPACING = 50;
 const LIMIT = 5_000;
 const PLANE_LIMIT = 30_000;
 const DOWNLOAD_LIMIT = 600_000;
+// Between two questions how far a field is.
+const FIELD_SPACING = 500;
 
 /** The pixel of a picture at a place of the window; null outside. `box` is the rectangle in which the picture is drawn. */
 export function pixelAt({ clientX, clientY }, box, [width, height]) {
@@ -93,10 +95,10 @@ export function address(path, token, query) {
 }
 
 /** Fetches from this server. Throws an error with the server's words. */
-async function get(url, limit) {
+async function get(url, limit, signal) {
   let answer;
   try {
-    answer = await fetch(url, { signal: AbortSignal.timeout(limit) });
+    answer = await fetch(url, { signal: AbortSignal.any([AbortSignal.timeout(limit), ...(signal ? [signal] : [])]) });
   } catch (error) {
     throw new Error(error.name === "TimeoutError" ? "the server did not answer in time" : "the server is not reached", { cause: error });
   }
@@ -127,6 +129,27 @@ export function fileName(run, { frame, slide }, ending) {
   return `${run}-frame-${String(frame).padStart(6, "0")}-slide-${String(slide).padStart(4, "0")}.${ending}`;
 }
 
+/** How far the field of a slide is. */
+export function fieldWords({ slide, share, seconds_left: left }) {
+  return `Tracing the FTLE of slide ${count(slide)} beside the run: ${percent(share)}${left === null ? "" : `, about ${duration(left)} left`}.`;
+}
+
+/** Saves the FTLE field of a slide (null: the newest), which the server traces first; `tell` gets words meanwhile. Returns the name of the file. */
+export async function downloadField({ token, slide, tell, signal }) {
+  for (let wanted = slide; !signal.aborted; await new Promise((resolve) => { setTimeout(resolve, FIELD_SPACING); })) {
+    const answer = await get(address("field.nc", token, { slide: wanted }), DOWNLOAD_LIMIT, signal);
+    if (answer.status !== 202) {
+      const name = namedBy(answer) ?? "field.nc";
+      save(await answer.blob(), name);
+      return name;
+    }
+    const underway = await answer.json();
+    wanted = underway.slide;
+    if (!signal.aborted) tell(fieldWords(underway));
+  }
+  return null;
+}
+
 /** The command that writes the FTLE of a frame's slide as NetCDF, and what is to be said about it; `command` is null where none can. */
 export function fieldCommand(run, endpoint, { slide, time, date, tau, direction, live, time_unit: unit }) {
   if (live) return { words: "No command writes the field of a running simulation, whose steps are gone; ridgewatch ftle reads archives and closed forms.", command: null };
@@ -134,10 +157,12 @@ export function fieldCommand(run, endpoint, { slide, time, date, tau, direction,
   const published = endpoint?.startsWith("ipc://") ? "--set publish.endpoint=private " : "";
   const options = `--slide ${slide} --set time.tau=${tau} --set time.direction=${direction}`;
   return {
-    words: `Traces the FTLE of slide ${count(slide)}, t0 = ${date ?? withUnit(time, unit)}, on a grid (--grid sets it) beside the run; in the folder that holds the folder ${run} of the run:`,
+    words: `The FTLE of slide ${count(slide)}, t0 = ${date ?? withUnit(time, unit)}, on a grid of your own (--grid sets it), in the folder that holds the folder ${run} of the run:`,
     command: `ridgewatch ftle ${run}/scene.toml ${options} ${published}--out ${run}-slide-${String(slide).padStart(4, "0")}.nc`,
   };
 }
+
+const namedBy = (answer) => /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "")?.[1];
 
 function save(blob, name) {
   const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
@@ -154,8 +179,7 @@ export async function download(ending, { token, kept, shown, held }) {
   if (kept?.ready !== undefined) {
     try {
       const answer = await get(address(`frame.${ending}`, token, { frame: held ? shown.frame : null }), DOWNLOAD_LIMIT);
-      const named = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "");
-      save(await answer.blob(), named?.[1] ?? fileName(run, header.record, ending));
+      save(await answer.blob(), namedBy(answer) ?? fileName(run, header.record, ending));
       return null;
     } catch (error) {
       problem = error.message;

@@ -4,15 +4,18 @@
 
 mod cf;
 mod pixels;
+mod seeds;
 mod vtk;
 
 use super::error::PublishError;
 use crate::field::{Domain, Geometry};
 use crate::flow::{Direction, VelocitySource};
 use crate::run::{Plan, Slide};
+use crate::setting::word;
 use crate::source::Georeference;
 use cf::CfFile;
-pub use pixels::{MapAbout, NoMapField, map_netcdf};
+pub use pixels::{MapAbout, NoField, map_netcdf};
+pub use seeds::{NewestSlide, SeedField, SlideField, seeds};
 use std::path::{Path, PathBuf};
 use vtk::{VtkFiles, VtkKind};
 
@@ -94,9 +97,9 @@ pub struct Field<'a> {
 const STATUS: [(i8, &str); 4] = [(0, "integrated_over_tau"), (1, "left_or_stopped_earlier"), (2, "no_velocity"), (3, "overflow")];
 
 impl FieldFrame {
-    /// Of a plan and one of its slides. `integrator` describes the integration, `history` the command, with its date. `pointwise` names the truth
-    /// if every field will have the error of each seed.
-    pub fn new(plan: &Plan, slide: &Slide, grid: [usize; 3], integrator: String, history: String, pointwise: Option<&'static str>) -> Self {
+    /// Of a plan and one of its slides. `history` describes the command, with its date. `pointwise` names the truth if every field will have the error
+    /// of each seed.
+    pub fn new(plan: &Plan, slide: &Slide, grid: [usize; 3], history: String, pointwise: Option<&'static str>) -> Self {
         let geometry = match &slide.velocity {
             VelocitySource::Window(window) => window.grid().map_or(Geometry::Cartesian, |grid| grid.geometry),
             VelocitySource::Analytic(..) => Geometry::Cartesian,
@@ -110,7 +113,7 @@ impl FieldFrame {
             time_unit: plan.time_unit.clone(),
             title: plan.scene.title.clone(),
             source: plan.source.clone(),
-            integrator,
+            integrator: format!("{}, {}", word(plan.map.integrator), word(plan.map.precision)),
             tau: plan.map.tau,
             history,
             pointwise,

@@ -9,12 +9,15 @@ use crate::run::{Frame, FrameRecord, Plan};
 use crate::source::{Georeference, utc};
 use thiserror::Error;
 
-/// Why there is no file of a frame's pixels.
+/// Why there is no file of a frame's pixels, or of a slide's field.
 #[derive(Debug, Error)]
-pub enum NoMapField {
-    /// The frame is no field on axes.
+pub enum NoField {
+    /// The frame is no field on axes, or no frame is complete.
     #[error("{0}")]
-    NoField(String),
+    Missing(String),
+    /// What was asked for is no longer kept.
+    #[error("{0}")]
+    Gone(String),
     /// The system refuses.
     #[error("{0}")]
     System(String),
@@ -96,13 +99,13 @@ impl Centres {
 ///
 /// # Errors
 /// Why the frame is no such field, or what the system refuses.
-pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>, NoMapField> {
+pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>, NoField> {
     let Frame { film, record, .. } = frame;
     if record.method != Method::Map.name() {
         let found = format!("a frame of {} is a picture of a volume, which shows no FTLE below transfer.low", record.method);
-        return Err(NoMapField::NoField(found));
+        return Err(NoField::Missing(found));
     }
-    let centres = Centres::of(record).map_err(|why| NoMapField::NoField(format!("the frame is no field on axes: {why}")))?;
+    let centres = Centres::of(record).map_err(|why| NoField::Missing(format!("the frame is no field on axes: {why}")))?;
     let ([min_x, min_y], [max_x, max_y]) = (centres.first, centres.last);
     let domain = Domain { dimensions: 2, ..Domain::cuboid([min_x, min_y, 0.0], [max_x, max_y, 1.0]) };
     let steps = record.integration_steps.map_or_else(|| "adaptive steps".to_owned(), |steps| format!("{steps} steps"));
@@ -121,7 +124,7 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
         pointwise: None,
         of: Of::Pixels,
     };
-    let refused = |error: &dyn std::fmt::Display| NoMapField::System(error.to_string());
+    let refused = |error: &dyn std::fmt::Display| NoField::System(error.to_string());
     let folder = tempfile::tempdir().map_err(|error| refused(&error))?;
     let path = folder.path().join("map.nc");
     let values = [&film.ftle_mean, &film.error, &film.missing].map(|layer| centres.of_layer(layer, film.width));

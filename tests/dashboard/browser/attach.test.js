@@ -54,6 +54,11 @@ test("a running simulation is followed, its loss is told within 5 s, and its res
   await page.mouse.up();
   await until("a turned view", () => records().some((record) => record.frame > frame && String(record.camera.eye) !== String(camera.eye)));
 
+  // The field of the window that the run shows, which slides on meanwhile.
+  const [field] = await Promise.all([page.waitForEvent("download"), page.click("#field")]);
+  assert.match(field.suggestedFilename(), /^run-field-slide-\d{4}\.nc$/);
+  assert.equal(readFileSync(await field.path()).subarray(0, 3).toString(), "CDF");
+
   const warnings = () => page.textContent("#warnings");
   assert.doesNotMatch(await warnings(), /simulation/);
   const killed = Date.now();

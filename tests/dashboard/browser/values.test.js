@@ -1,7 +1,7 @@
 // The value under the pointer: which pixel it is, what is asked, and in which words it is told.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Values, fieldCommand, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
+import { Values, fieldCommand, fieldWords, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
 
 const values = {
   frame: 1200, slide: 3, x: 5, y: 7, size: [96, 48], unit: "1/s",
@@ -36,6 +36,11 @@ test("a map has a value with its error, and colours say no more", () => {
 
 test("names of files tell run, frame and slide", () => {
   assert.equal(fileName("gulf", { frame: 12, slide: 3 }, "exr"), "gulf-frame-000012-slide-0003.exr");
+});
+
+test("how far a field is has its time left, once seeds are traced", () => {
+  assert.equal(fieldWords({ slide: 1234, share: 0, seconds_left: null }), "Tracing the FTLE of slide 1,234 beside the run: 0 %.");
+  assert.equal(fieldWords({ slide: 3, share: 0.25, seconds_left: 9 }), "Tracing the FTLE of slide 3 beside the run: 25 %, about 9.0 s left.");
 });
 
 test("the command of a field names the slide, and of a simulation there is none", () => {
