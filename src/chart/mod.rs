@@ -14,18 +14,16 @@ mod slides;
 mod still;
 mod table;
 mod train;
-mod trial;
 mod verdict;
 
 pub use draw::{DrawError, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{FtlePanel, FtlePoint};
-pub use picture::{Auto, PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};
+pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};
 pub use scaling::{ScalingPanel, ScalingPoint};
 pub use still::fixed_colours;
 pub use table::csv;
 pub use train::{Epoch, TrainOptions, TrainReport, train};
-pub use trial::{Choice, TRIAL_SECONDS, choose};
 pub use verdict::verdict;
 
 #[cfg(feature = "cuda")]

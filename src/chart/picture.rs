@@ -1,13 +1,12 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
 use super::slides::FirstSlides;
-use super::still::{colours_of, compile, noise_psnr, still};
-use super::trial::{TRIAL_SECONDS, race};
+use super::still::{colours_of, compile, still};
 use super::{Charting, with_method};
 use crate::publish::compare_films;
 use crate::render::smooth::{LIT, squared_slope};
-use crate::render::{Film, Method};
-use crate::run::{Event, Frame, RunError, RunOptions, Settings, run};
+use crate::render::{Film, Method, noise_psnr};
+use crate::run::{Event, Frame, Race, RunError, RunOptions, Settings, run};
 use crate::surrogate::Kind;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -73,7 +72,7 @@ pub struct Sliding {
 }
 
 impl PictureCurve {
-    fn new(method: Method, kind: Kind) -> Self {
+    pub(super) fn new(method: Method, kind: Kind) -> Self {
         let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
         Self { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None }
     }
@@ -104,17 +103,10 @@ pub struct PicturePanel {
     pub truth_psnr: f64,
     /// One curve per method and surrogate.
     pub curves: Vec<PictureCurve>,
-    /// What `render.method = "auto"` chooses; `None` if there was no time for its trial.
-    pub auto: Option<Auto>,
-}
-
-/// The choice of `render.method = "auto"`.
-#[derive(Debug, Clone, Serialize)]
-pub struct Auto {
-    /// Name of the curve of the chosen method and the scene's surrogate.
-    pub curve: String,
-    /// Seconds of the trial, once for a scene on a device.
-    pub trial_seconds: f64,
+    /// Kind of the scene's surrogate.
+    pub kind: Kind,
+    /// The same race as that of `render.method = "auto"`, by the true errors of these curves; `None` if no method reached its target.
+    pub race: Option<Race>,
 }
 
 /// Two independent pictures of the same scene. Half of their difference is the noise of their mean, which is taken off from squared errors against it.
@@ -239,7 +231,14 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
     let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?;
     if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
         charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
-        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new(), auto: None });
+        return Ok(PicturePanel {
+            size,
+            truth_samples: samples,
+            truth_psnr: f64::INFINITY,
+            curves: Vec::new(),
+            kind: settings.surrogate.kind,
+            race: None,
+        });
     }
     let last_truth = if slides.count() < SLIDES {
         charting.skip("a sliding window", format_args!("it takes {SLIDES} slides, {} could be read: {}", slides.count(), slides.end()));
@@ -269,20 +268,6 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
     if let Err(error) = compile(&settings, &options, slides) {
         charting.refused("a first frame, which compiles kernels", error)?;
     }
-    // Measured before the curves, which take all the time that is left.
-    let mut auto = None;
-    if charting.left() < 4.0 * TRIAL_SECONDS {
-        charting.skip("the trial of auto", "too little time was left (--seconds)");
-    } else if charting.has_time_for("the trial of auto") {
-        let began = Instant::now();
-        match race(charting.settings, charting.device, options.threads, charting.stop, slides) {
-            Ok(choice) => {
-                let curve = PictureCurve::new(choice.method, charting.settings.surrogate.kind).name();
-                auto = Some(Auto { curve, trial_seconds: began.elapsed().as_secs_f64() });
-            }
-            Err(error) => charting.refused("the trial of auto", error)?,
-        }
-    }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
         let mut curve = PictureCurve::new(method, kind);
         if !charting.has_time_for(&format!("pictures by {}", curve.name())) {
@@ -305,7 +290,12 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         }
         curves.push(curve);
     }
-    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves, auto })
+    let kind = settings.surrogate.kind;
+    let race = Race::of_times(|method, target| {
+        let name = PictureCurve::new(method, kind).name();
+        curves.iter().find(|curve| curve.name() == name).and_then(|curve| curve.seconds_to(target))
+    });
+    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind, race })
 }
 
 /// Frames of a still window for some seconds; returns the bytes of the surrogate.

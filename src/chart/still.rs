@@ -5,23 +5,10 @@ use super::{failed, with_method};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device};
-use crate::render::smooth::{LIT, squared_slope};
-use crate::render::{Film, Method, TransferSettings};
+use crate::render::{Method, TransferSettings};
 use crate::run::{Event, Frame, Plan, RunError, RunOptions, Settings, Setup, Slide, run, settled_colours};
 use crate::surrogate::Kind;
 use std::sync::atomic::{AtomicBool, Ordering};
-
-/// PSNR over lit pixels, in decibels, of the mean of two independent pictures, from their difference.
-pub(super) fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
-    let (mut sum, mut lit) = (0.0, 0.0);
-    for (a, b) in a.rgba.iter().zip(&b.rgba).filter(|(a, b)| a[3] + b[3] > 2.0 * LIT) {
-        lit += 1.0;
-        for (a, b) in a[..3].iter().zip(&b[..3]) {
-            sum += f64::from(squared_slope(tone_map, 0.5 * (a + b))) * f64::from(0.5 * (a - b)).powi(2) / 3.0;
-        }
-    }
-    -10.0 * (sum / lit).max(1e-12).log10()
-}
 
 /// Transfer function for all pictures of a chart, scaled to the first slide's FTLE where the scene leaves it open.
 ///

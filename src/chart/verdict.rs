@@ -1,8 +1,9 @@
 //! What a chart says, in words.
 
 use super::ftle::{FtlePanel, FtlePoint};
-use super::picture::{Auto, PicturePanel, RESOLVED, TARGETS};
+use super::picture::{PictureCurve, PicturePanel, RESOLVED, TARGETS};
 use super::{Chart, pick};
+use crate::render::Method;
 
 /// Numbers of samples for which building is charged.
 pub(super) const CHARGED: [f64; 3] = [1e6, 1e9, 1e11];
@@ -118,7 +119,7 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
             }
         });
     }
-    said.extend(panel.auto.as_ref().map(|auto| of_auto(panel, auto)));
+    said.push(of_auto(panel));
     let sliding = |curve: &super::PictureCurve| {
         curve.sliding.map(|found| {
             let psnr = found.psnr.map_or(String::new(), |psnr| format!(" at {psnr:.1} dB"));
@@ -131,12 +132,14 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
     }
 }
 
-/// How far the choice of `auto` is from the best curve.
-fn of_auto(panel: &PicturePanel, auto: &Auto) -> String {
-    let chosen = panel.curves.iter().find(|curve| curve.name() == auto.curve);
+/// How far `auto` is from the best curve, which begins with `two_level` and the scene's surrogate, and goes on with the method that wins its race.
+fn of_auto(panel: &PicturePanel) -> String {
+    let name = |method| PictureCurve::new(method, panel.kind).name();
+    let first = name(Method::TwoLevel);
+    let curve = panel.curves.iter().find(|curve| curve.name() == first);
     let compared = TARGETS.iter().filter_map(|&target| {
         let best = panel.curves.iter().filter_map(|curve| curve.seconds_to(target)).min_by(f64::total_cmp)?;
-        Some(match chosen.and_then(|curve| curve.seconds_to(target)) {
+        Some(match curve.and_then(|curve| curve.seconds_to(target)) {
             Some(seconds) if seconds <= best => format!("first at {target} dB"),
             Some(seconds) => format!("{:.0} % after the first at {target} dB", 100.0 * (seconds / best - 1.0)),
             None => format!("does not reach {target} dB, which others do"),
@@ -144,7 +147,12 @@ fn of_auto(panel: &PicturePanel, auto: &Auto) -> String {
     });
     let compared: Vec<String> = compared.collect();
     let compared = if compared.is_empty() { "no target was reached".to_owned() } else { compared.join(", ") };
-    format!("render.method = \"auto\" chooses {} in a trial of {}: {compared}.", auto.curve, duration(auto.trial_seconds))
+    let goes_on = match &panel.race {
+        Some(race) if race.method != Method::TwoLevel => format!(" Its race between {first} and others goes to {}.", name(race.method)),
+        Some(_) => " It stays with it in its race.".to_owned(),
+        None => String::new(),
+    };
+    format!("render.method = \"auto\" begins with {first}: {compared}.{goes_on}")
 }
 
 fn name(point: &FtlePoint) -> String {

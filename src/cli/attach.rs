@@ -7,7 +7,6 @@ use super::{messages, notify};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::RunFolder;
-use ridgewatch::render::Method;
 use ridgewatch::run::{RunError, Setup};
 use ridgewatch::source::live::Live;
 use ridgewatch::source::{SourceError, SourceKind};
@@ -48,11 +47,6 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         messages::note("network.size is \"auto\": weights of an earlier run are not used, since a checkpoint has one size");
     }
     options.run.apply(&mut scene)?;
-    if scene.render.method == Method::Auto {
-        // A trial needs a window that comes twice.
-        scene.render.method = Method::TwoLevel;
-        messages::note("render.method = \"auto\": two_level, since a running simulation has no trial");
-    }
     options.run.stop_within.get_or_insert(STOP_WITHIN);
     let text = scene.to_toml()?;
     let mut resume_if_fit = None;
@@ -82,7 +76,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, RunError::refused))
     };
     let follows = Some(Follows { checkpoint_seconds: CHECKPOINT_SECONDS, resume_if_fit, wanted });
-    Session { common, options: &options.run, scene, text, follows, chart: None }.run(open)
+    Session { common, options: &options.run, scene, text, follows, chart: None, race: None }.run(open)
 }
 
 /// Reads the scene, with the places of the simulation from the command line.

@@ -1,6 +1,6 @@
 //! `ridgewatch chart`: speed against accuracy of a scene, and the pick.
 
-use super::common::{CHART, Common, Interrupted, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
+use super::common::{CHART, Common, Interrupted, RaceFile, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
@@ -83,6 +83,10 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
             Ok(()) => messages::note(format_args!("the dashboard of this scene shows {}", path.display())),
             Err(error) => messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display())),
         }
+    }
+    let race = chart.pictures.as_ref().and_then(|pictures| pictures.race.clone()).filter(|_| stop.status() == 0);
+    if let (Some(file), Some(race)) = (RaceFile::of(common, &scene, &options.paths, &device)?, race) {
+        file.write(race)?;
     }
     for (name, bytes) in files {
         let path = options.out.join(name);

@@ -3,18 +3,17 @@
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, DeviceChoice};
-use ridgewatch::chart::{Choice, TRIAL_SECONDS, choose, device_name};
+use ridgewatch::chart::device_name;
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{Decision, RunError, Settings, Setup, why_steps};
+use ridgewatch::run::{Race, RunError, Settings, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicBool;
 
 /// Options of every command.
 #[derive(Debug, clap::Args)]
@@ -109,64 +108,57 @@ pub fn beside_scene(paths: &[PathBuf], ending: &str) -> Option<PathBuf> {
     }
 }
 
-/// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene and data on the same
-/// device. Returns the decision; `None` if the scene names a method.
-pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<Option<Decision>> {
-    if scene.render.method != Method::Auto {
-        return Ok(None);
-    }
-    let untried = if scene.render.until.is_some() || scene.render.budget.is_some() {
-        Some("only smooth methods have render.until and render.budget")
-    } else if scene.archive.follow.is_some() {
-        Some("an archive that is followed may have no window yet to try methods on")
-    } else {
-        None
-    };
-    if let Some(why) = untried {
-        scene.render.method = Method::TwoLevel;
-        messages::note(format_args!("render.method = \"auto\": two_level, since {why}"));
-        return Ok(Some(Decision::new("render.method", "two_level", why)));
-    }
-    let files = if scene.archive.files.is_empty() {
-        Vec::new()
-    } else {
-        expand(&scene.archive.files).map_err(|error| located(scene, RunError::from(error), RunError::refused))?
-    };
-    let data: Vec<_> = files.iter().filter_map(|file| std::fs::metadata(file).ok().filter(std::fs::Metadata::is_file)).collect();
-    // A folder does not tell of changes inside.
-    let remembered = beside_scene(paths, "auto.json").filter(|_| data.len() == files.len());
-    let data: Vec<_> = files.iter().zip(&data).map(|(file, found)| (file, found.len(), found.modified().ok())).collect();
-    let version = env!("CARGO_PKG_VERSION");
-    let asked = format!("{version} {} {} threads {data:?} {}", device_name(device), common.threads, scene.to_toml()?);
-    let earlier = remembered.as_deref().and_then(|file| std::fs::read(file).ok()).and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    let choice = match earlier.filter(|earlier: &Remembered| earlier.asked == asked) {
-        Some(Remembered { choice, .. }) => choice,
-        None => {
-            let _spinner =
-                messages::spinner(format!("trying methods on the first slide: {TRIAL_SECONDS} s of frames, and their preparation"));
-            let choice = choose(&scene.settings(), device, common.threads, &AtomicBool::new(false))
-                .map_err(|error| located(scene, error, RunError::refused))?;
-            if let Some(file) = &remembered {
-                // A folder that cannot be written costs the next start its trial, and nothing else.
-                let text = serde_json::to_vec_pretty(&Remembered { asked, choice: choice.clone() })?;
-                if let Err(error) = ridgewatch::files::write_whole(file, &text) {
-                    messages::note(format_args!("the choice is not remembered: {}: {error}", file.display()));
-                }
-            }
-            choice
-        }
-    };
-    messages::note(&choice);
-    scene.render.method = choice.method;
-    Ok(Some(Decision::new("render.method", choice.method.name(), choice.why())))
+/// The last race of methods of `render.method = "auto"`, kept beside a scene file for its next run on the same data and device.
+pub struct RaceFile {
+    path: PathBuf,
+    /// What a race is of: version, device, threads, names, lengths and times of the data files, and scene.
+    of: String,
 }
 
-/// File beside a scene file with the choice of `render.method = "auto"`.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Remembered {
-    /// What was asked: version, device, threads, names, lengths and times of the data files, and scene.
-    asked: String,
-    choice: Choice,
+    of: String,
+    race: Race,
+}
+
+impl RaceFile {
+    /// `None` without races, for data files alone, and for data in folders, which do not tell of changes inside.
+    pub fn of(common: &Common, scene: &SceneFile, paths: &[PathBuf], device: &Device) -> Result<Option<Self>> {
+        let path = beside_scene(paths, "auto.json").filter(|_| scene.render.method == Method::Auto);
+        let Some(path) = path else { return Ok(None) };
+        let files = if scene.archive.files.is_empty() {
+            Vec::new()
+        } else {
+            expand(&scene.archive.files).map_err(|error| located(scene, RunError::from(error), RunError::refused))?
+        };
+        let data: Vec<_> = files.iter().filter_map(|file| std::fs::metadata(file).ok().filter(std::fs::Metadata::is_file)).collect();
+        if data.len() != files.len() {
+            return Ok(None);
+        }
+        let data: Vec<_> = files.iter().zip(&data).map(|(file, found)| (file, found.len(), found.modified().ok())).collect();
+        // What does not change the time from a slide to a picture.
+        let mut racing = scene.clone();
+        (racing.time.slides, racing.time.frames_per_slide, racing.time.warmup_frames) = (None, 1, 0);
+        (racing.publish, racing.title) = (Default::default(), String::new());
+        let version = env!("CARGO_PKG_VERSION");
+        let of = format!("{version} {} {} threads {data:?} {}", device_name(device), common.threads, racing.to_toml()?);
+        Ok(Some(Self { path, of }))
+    }
+
+    /// The race of an earlier run.
+    pub fn read(&self) -> Option<Race> {
+        let remembered: Remembered = serde_json::from_slice(&std::fs::read(&self.path).ok()?).ok()?;
+        Some(remembered.race).filter(|_| remembered.of == self.of)
+    }
+
+    /// Keeps a race. A folder that cannot be written costs the next run its own race, and nothing else.
+    pub fn write(self, race: Race) -> Result<()> {
+        let text = serde_json::to_vec_pretty(&Remembered { of: self.of, race })?;
+        if let Err(error) = ridgewatch::files::write_whole(&self.path, &text) {
+            messages::note(format_args!("the race of methods is not remembered: {}: {error}", self.path.display()));
+        }
+        Ok(())
+    }
 }
 
 /// Adds the place of the setting at fault, if a setting is at fault.

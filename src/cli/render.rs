@@ -1,7 +1,7 @@
 //! `ridgewatch render`.
 
 use super::common::{
-    Common, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene, settle_method,
+    Common, RaceFile, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene,
     text_with_tau, verifies_nothing,
 };
 use super::{messages, session};
@@ -78,12 +78,13 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.set_by("time.warmup_frames", format!("--warmup {frames}"));
     }
     let device = device(common, &scene)?;
-    settle_method(common, &mut scene, &options.paths, &device)?;
+    let earlier = RaceFile::of(common, &scene, &options.paths, &device)?.and_then(|race| race.read());
     check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let run_options = RunOptions { verify_points: options.verify as usize, threads: common.threads, device, ..RunOptions::default() };
     let scene_text = scene.to_toml()?;
-    let setup = open(&scene)?;
+    let mut setup = open(&scene)?;
+    setup.earlier_race = earlier;
     if let Some(usage) = verifies_nothing(&setup, options.verify) {
         bail!(usage);
     }

@@ -1,6 +1,6 @@
 //! `ridgewatch replay`.
 
-use super::common::{CHART, Common, beside_scene, device, open_by, scene, seconds, settle_method};
+use super::common::{CHART, Common, RaceFile, beside_scene, device, open_by, scene, seconds};
 use super::session::{RunArguments, Session};
 use anyhow::Result;
 use ridgewatch::run::Setup;
@@ -29,12 +29,13 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.set_by("archive.follow", format!("--follow={seconds}"));
     }
     let device = device(common, &scene)?;
-    let method = settle_method(common, &mut scene, &options.paths, &device)?;
+    let race = RaceFile::of(common, &scene, &options.paths, &device)?;
+    let earlier = race.as_ref().and_then(RaceFile::read);
     let text = scene.to_toml()?;
     let chart = beside_scene(&options.paths, CHART);
-    Session { common, options: &options.run, scene, text, follows: None, chart }.run(|scene, _| {
+    Session { common, options: &options.run, scene, text, follows: None, chart, race }.run(|scene, _| {
         let mut setup = open_by(scene, Setup::following)?;
-        setup.decisions.extend(method);
+        setup.earlier_race = earlier;
         Ok(Some(setup))
     })
 }

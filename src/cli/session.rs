@@ -1,8 +1,8 @@
 //! A run of `replay` or `attach`: from a scene to a run folder and the socket.
 
 use super::common::{
-    Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
-    text_with_tau, verifies_nothing,
+    Common, Interrupted, RaceFile, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text,
+    seconds, text_with_tau, verifies_nothing,
 };
 use super::signals::Stop;
 use super::{dashboard, messages, notify};
@@ -110,6 +110,8 @@ pub struct Session<'a> {
     pub follows: Option<Follows>,
     /// Where a chart of the scene would be.
     pub chart: Option<PathBuf>,
+    /// Where the last race of methods is kept; `None` if it is not.
+    pub race: Option<RaceFile>,
 }
 
 /// What a run that follows a simulation has besides.
@@ -125,7 +127,7 @@ pub struct Follows {
 impl Session<'_> {
     /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
     pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
-        let Self { common, options, scene, text, follows: following, chart } = self;
+        let Self { common, options, scene, text, follows: following, chart, race } = self;
         let wanted = following.as_ref().filter(|_| !options.overwrite).map(|following| following.wanted.as_path());
         // Before any wait or work. The folder is checked again when it is created, in case another run takes it meanwhile.
         match RunFolder::refuse_occupied(&options.out, options.overwrite) {
@@ -212,6 +214,9 @@ impl Session<'_> {
         let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| !follows && publish.maps);
         let (result, last, summary) = work(setup, &scene, &run_options, output, newest, maps, &stop.requested);
         let report = result?;
+        if let (Some(file), Some(found)) = (race, &report.race) {
+            file.write(found.clone())?;
+        }
         for warning in &report.warnings {
             messages::note(format_args!("after the last frame: {warning}"));
         }
@@ -375,7 +380,9 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
         }
         Event::Note(text) => {
             bar.suspend(|| messages::note(text));
-            notify::running(|| "preparing the first frame".into());
+            if last.is_none() {
+                notify::running(|| "preparing the first frame".into());
+            }
         }
         Event::Slide(_) => {}
         Event::Progress(share) => {
@@ -460,6 +467,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "transfer": report.transfer,
         "surrogate_bytes": report.surrogate_bytes,
         "decisions": report.decisions,
+        "race": report.race,
         "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
         "checkpoints": report.checkpoints,

@@ -37,7 +37,7 @@ pub enum Method {
     TwoLevel,
     /// The FTLE itself of a flow of two dimensions, as a map: the mean over each pixel, traced.
     Map,
-    /// `two_level` or `reference`, by a trial before the run. A run itself has one of the others.
+    /// As [`Method::Default`]; where that is `two_level`, `marched` or `reference` takes over if it wins a race in the run.
     Auto,
     /// `map` for flows of two dimensions, unless the scene sets what only volumes have ([`Method::or_default`]), and `two_level` for others. The default.
     /// A run itself has one of the others.

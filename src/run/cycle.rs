@@ -7,6 +7,7 @@
 use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::decision::{Decision, enter_colours, why_steps};
+use super::race::{Pace, Race, Races};
 use super::record::Frame;
 use super::refine::Frames;
 use super::scene::settled_scene;
@@ -67,7 +68,7 @@ pub enum Event {
         /// Remarks on the settings and the source.
         notes: Vec<String>,
     },
-    /// A remark after [`Event::Begin`] and before the first frame.
+    /// A remark after [`Event::Begin`].
     Note(String),
     /// A finished frame.
     Frame(Frame),
@@ -116,6 +117,8 @@ pub struct RunReport {
     pub surrogate_bytes: usize,
     /// What was chosen for settings that the scene leaves open: one entry a setting, the last choice for it.
     pub decisions: Vec<Decision>,
+    /// The last race of methods; `None` if there was none.
+    pub race: Option<Race>,
     /// Changes of its size with `size = "auto"`, with reasons; a few dozen at most, since no rejected size is tried twice.
     pub sizes: Vec<String>,
     /// Resolution of the snapshots in time; `None` for closed forms.
@@ -165,6 +168,8 @@ pub(super) struct Run<'a> {
     pub(super) progress: RunProgress,
     /// `None` if the run writes no checkpoints.
     pub(super) checkpoints: Option<Checkpoints>,
+    /// `None` if the method is given.
+    pub(super) races: Option<Races>,
 }
 
 /// State of learning, apart from the surrogate itself.
@@ -227,6 +232,10 @@ pub(super) struct RunProgress {
     pub(super) waited: f64,
     /// True if the device had no room for a finer table in this slide.
     pub(super) lacks_room_for_nodes: bool,
+    /// Seconds of building the surrogate, or of moving it to the window, when that was last done.
+    pub(super) surrogate_seconds: f64,
+    /// Seconds of races since the last frame.
+    pub(super) raced: f64,
 }
 
 impl RunProgress {
@@ -340,7 +349,7 @@ fn drive<B: Backend>(
     report: &mut RunReport,
 ) -> Result<(), RunEnd> {
     let began = Instant::now();
-    let Setup { plan, mut slides, notes, decisions } = setup;
+    let Setup { plan, mut slides, notes, decisions, earlier_race } = setup;
     report.decisions = decisions;
     let time = &plan.scene.time;
     let planned = slides.expected().filter(|_| plan.scene.render.until.is_none());
@@ -374,7 +383,7 @@ fn drive<B: Backend>(
         }
     };
     slide.warnings.append(&mut beginning.warnings);
-    let from = RunGiven { plan: &plan, options, threads, stop, began, report };
+    let from = RunGiven { plan: &plan, options, threads, stop, began, earlier_race, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
     let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None };
@@ -399,6 +408,7 @@ struct RunGiven<'a> {
     threads: Threads,
     stop: &'a AtomicBool,
     began: Instant,
+    earlier_race: Option<Race>,
     report: &'a mut RunReport,
 }
 
@@ -441,7 +451,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
 
 impl<'a> Run<'a> {
     fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
-        let RunGiven { plan, options, threads, stop, began, report } = frame;
+        let RunGiven { plan, options, threads, stop, began, earlier_race, report } = frame;
         let scene = &plan.scene;
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
@@ -506,7 +516,15 @@ impl<'a> Run<'a> {
             peak: f32::NEG_INFINITY,
         };
         let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
-        let (progress, render) = (RunProgress::default(), scene.render.clone());
+        let races = plan.races.then(|| Races::new(earlier_race.as_ref()));
+        let mut render = scene.render.clone();
+        if let Some(race) = earlier_race.filter(|_| plan.races) {
+            Decision::new("render.method", race.method.name(), format_args!("{}, in an earlier run", race.why()))
+                .enter(&mut report.decisions);
+            render = drawn_by(&render, race.method, render.budget);
+            options.steering.iter().for_each(|steering| steering.keep_method(race.method));
+        }
+        let progress = RunProgress::default();
         Ok(Self {
             plan,
             options,
@@ -524,6 +542,7 @@ impl<'a> Run<'a> {
             learning,
             progress,
             checkpoints,
+            races,
         })
     }
 }
@@ -620,7 +639,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     fn prepare_first(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
-        if self.run.plan.scene.render.method.has_surrogate() {
+        if self.run.keeps_surrogate() {
             transaction!(self, slide, run, on => run.build_surrogate(on));
         }
         let named = &self.run.plan.scene.training.resume;
@@ -660,7 +679,9 @@ impl<B: Backend> Cycle<'_, B> {
     /// Moves the session to the next window: tables are traced again, weights are kept, and trust starts again from nothing. Old labels are tested
     /// (unless the network has the start time as an input).
     fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
-        self.look_at_steps(slide)?;
+        if self.look_at_steps(slide)? {
+            self.run.races.iter_mut().for_each(Races::begin_anew);
+        }
         self.trace_anew(slide)
     }
 
@@ -686,6 +707,7 @@ impl<B: Backend> Cycle<'_, B> {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let planned = warmups + time.frames_per_slide;
         let (mut number, mut since_command) = (0, None);
+        let mut pace = Pace::default();
         loop {
             // The next window may never come, so this one's next frame tells of a loss.
             slide.warnings.extend(slides.loss());
@@ -709,6 +731,11 @@ impl<B: Backend> Cycle<'_, B> {
                     on.picture = Default::default();
                 });
                 self.trace_anew(slide)?;
+                self.run.learning.trust.reset();
+                self.probe_again(slide)?;
+            }
+            if self.run.keeps_surrogate() && with!(&self.session, on => on.surrogate.is_none()) {
+                transaction!(self, slide, run, on => run.build_surrogate(on));
                 self.run.learning.trust.reset();
                 self.probe_again(slide)?;
             }
@@ -743,6 +770,7 @@ impl<B: Backend> Cycle<'_, B> {
             slide.waited = 0.0;
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
+            pace.add(&frame.record);
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
@@ -775,7 +803,7 @@ impl<B: Backend> Cycle<'_, B> {
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
             if !self.is_another_due(slides, slide.live.is_some())? {
                 self.frames_before = number.min(most).saturating_sub(warmups);
-                return Ok(());
+                return self.race(slides, slide, &pace, sink);
             }
         }
     }
@@ -907,7 +935,10 @@ impl Run<'_> {
         self.has_range |= set.range.is_some();
         // The flow map follows once all commands are applied.
         self.asked = asked(&self.plan.map, &self.asked, set);
+        let is_other = set.range.is_some() || set.tolerance.is_some() || set.tau.is_some() || set.direction.is_some();
+        self.races.iter_mut().filter(|_| is_other).for_each(Races::begin_anew);
         if let Some(method) = set.method {
+            self.races = None;
             Decision::withdraw(&mut self.report.decisions, &["render.method"]);
             // Of another method.
             self.progress.seconds_per_sample = None;

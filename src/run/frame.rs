@@ -53,11 +53,7 @@ impl Run<'_> {
         let preparation_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
         let method = self.render.method;
-        let gate = match method {
-            Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto | Method::Default => self.learning.trust.gate(),
-            Method::Reference | Method::Map => Gate::uniform(false),
-            Method::Surrogate => Gate::uniform(true),
-        };
+        let gate = self.gate(method);
         // The frame is rendered with frozen weights, which were not trained on its samples.
         let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
         let frozen = serves.map(Surrogate::freeze).transpose()?;
@@ -117,7 +113,7 @@ impl Run<'_> {
         }
         let (tally, stats) = (&work.rendered.tally, &work.rendered.stats);
         record.seconds = StageSeconds {
-            slide: place.preparing,
+            slide: place.preparing + std::mem::take(&mut self.progress.raced),
             waiting: slide.waited,
             refine: place.refining,
             render: work.render_seconds - tally.trace_seconds - tally.predict_seconds,
@@ -146,6 +142,42 @@ impl Run<'_> {
             color_bar: Some(Arc::clone(&self.color_bar)),
             gate: frozen.is_some().then(|| Arc::new(gate)),
         })
+    }
+
+    /// Which queries the surrogate answers.
+    pub(super) fn gate(&self, method: Method) -> Gate {
+        match method {
+            Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto | Method::Default => self.learning.trust.gate(),
+            Method::Reference | Method::Map => Gate::uniform(false),
+            Method::Surrogate => Gate::uniform(true),
+        }
+    }
+
+    /// Settings of a frame of so many samples a pixel whose picture accumulates; `None` for other methods.
+    pub(super) fn smooth<B: Backend>(
+        &self,
+        backend: &B,
+        surrogate: Option<&B::Surrogate>,
+        method: Method,
+        samples_per_pixel: f64,
+    ) -> Result<Option<Smooth>, DeviceError> {
+        if !method.is_smooth() {
+            return Ok(None);
+        }
+        let learns = surrogate.is_some_and(Surrogate::learns);
+        let table_nodes = surrogate.and_then(Surrogate::table_nodes);
+        let nodes = match table_nodes.filter(|_| !learns) {
+            Some(nodes) => nodes,
+            None => {
+                let set = self.learning.settings.nodes(&self.plan.domain);
+                set.map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?
+            }
+        };
+        // As many as take as long as the samples. A surrogate with a table is as good as that where it is not trusted.
+        let a_sample = backend.nodes_per_sample()[1] * self.render.width * self.render.height;
+        let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
+        let traced_nodes = if learns && table_nodes.is_none() { (a_sample as f64 * samples) as usize } else { 0 };
+        Ok(Some(Smooth { method, sum: self.plan.scene.render.combine == Combine::Sum, nodes, traced_nodes }))
     }
 
     /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame
@@ -183,22 +215,7 @@ impl Run<'_> {
             Some(samples) => samples as f64,
             None => self.progress.affordable_samples(&self.render),
         };
-        let smooth = match method {
-            method if method.is_smooth() => {
-                let set = || self.learning.settings.nodes(&self.plan.domain);
-                let nodes = match surrogate.as_ref().filter(|surrogate| !surrogate.learns()).and_then(Surrogate::table_nodes) {
-                    Some(nodes) => nodes,
-                    None => set().map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?,
-                };
-                // As many as take as long as the samples. A surrogate with a table is as good as that where it is not trusted.
-                let a_sample = backend.nodes_per_sample()[1] * self.render.width * self.render.height;
-                let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
-                let has_table = surrogate.as_ref().and_then(Surrogate::table_nodes).is_some();
-                let traced_nodes = if learns && !has_table { (a_sample as f64 * samples) as usize } else { 0 };
-                Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes, traced_nodes })
-            }
-            _ => None,
-        };
+        let smooth = self.smooth(backend, surrogate.as_ref(), method, samples_per_pixel)?;
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);

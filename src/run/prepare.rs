@@ -15,6 +15,7 @@ use crate::surrogate::network::{Input, uniform};
 use crate::surrogate::{Kind, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata};
 use rayon::prelude::*;
+use std::time::Instant;
 
 /// Number of frames whose samples the replay buffer can hold at least: a frame keeps at most this part of the capacity.
 const FRAMES_IN_BUFFER: usize = 4;
@@ -44,11 +45,12 @@ impl Run<'_> {
             replay_buffer: scene.training.replay_buffer,
             stop: self.stop,
         };
-        let On { backend, tracer, surrogate, .. } = on;
+        let (On { backend, tracer, surrogate, .. }, begin) = (on, Instant::now());
         let tracer = present(tracer);
         let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
         check_stop(self.stop)?;
         *surrogate = Some(built);
+        self.progress.surrogate_seconds = begin.elapsed().as_secs_f64();
         self.progress.warnings.extend(backend.warnings());
         Ok(())
     }
@@ -82,11 +84,12 @@ impl Run<'_> {
 
     /// Moves the surrogate to the session's window.
     pub(super) fn slide_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
-        let On { tracer, surrogate, .. } = on;
+        let (On { tracer, surrogate, .. }, begin) = (on, Instant::now());
         if let Some(surrogate) = surrogate {
             let tracer = present(tracer);
             self.threads.render().install(|| surrogate.window_slid(tracer, self.stop))?;
             check_stop(self.stop)?;
+            self.progress.surrogate_seconds = begin.elapsed().as_secs_f64();
         }
         Ok(())
     }

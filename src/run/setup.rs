@@ -2,6 +2,7 @@
 
 use super::decision::Decision;
 use super::default_tau::default_tau;
+use super::race::Race;
 use super::settings::with_ends;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
 use super::{RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
@@ -32,6 +33,8 @@ pub struct Plan {
     pub time_unit: String,
     /// Names and meaning of the domain's coordinates; empty if they are in no file.
     pub georeference: Georeference,
+    /// The method is chosen by races, and the one of the scene is the first (`render.method = "auto"`).
+    pub races: bool,
 }
 
 /// A plan and its opened source.
@@ -44,6 +47,8 @@ pub struct Setup {
     pub notes: Vec<String>,
     /// Choices for settings that the scene leaves open.
     pub decisions: Vec<Decision>,
+    /// The last race of an earlier run of the same scene: a run whose plan has races begins with the method that won it.
+    pub earlier_race: Option<Race>,
 }
 
 /// The rule by which steps are chosen on a closed form or a grid.
@@ -94,10 +99,6 @@ impl Setup {
     }
 
     fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, RunError> {
-        if scene.render.method == Method::Auto {
-            let accepted = "a method: the commands replay and render choose it by a trial";
-            return Err(Refused::new("render.method", "is \"auto\"", accepted).into());
-        }
         let (mut notes, mut decisions) = (Vec::new(), Vec::new());
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
@@ -177,7 +178,7 @@ impl Setup {
             (_, _, Some(grid)) => grid.domain(),
             _ => return Err(no_domain()),
         };
-        settle_method(&mut scene, &domain, &mut decisions)?;
+        let races = settle_method(&mut scene, &domain, &mut decisions)?;
         notes.extend(unused_by_maps(&scene));
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
@@ -221,17 +222,24 @@ impl Setup {
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
-        Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference }, slides, notes, decisions })
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference, races }, slides, notes, decisions, earlier_race: None })
     }
 }
 
-/// Replaces `render.method = "default"`: flows of two dimensions are drawn as maps, unless the scene sets what only volumes have.
-fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Decision>) -> Result<(), Refused> {
+/// Replaces `render.method = "default"` and `"auto"`: flows of two dimensions are drawn as maps, unless the scene sets what only volumes have. Returns
+/// whether methods race.
+fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Decision>) -> Result<bool, Refused> {
     let is_flat = domain.dimensions == 2;
-    if scene.render.method == Method::Default {
+    let wanted = scene.render.method;
+    let mut races = false;
+    if matches!(wanted, Method::Auto | Method::Default) {
         let of_volumes = of_volumes(scene);
-        scene.render.method = scene.render.method.or_default(is_flat && of_volumes.is_empty());
+        scene.render.method = Method::Default.or_default(is_flat && of_volumes.is_empty());
+        let is_bound = scene.render.until.is_some() || scene.render.budget.is_some();
+        races = wanted == Method::Auto && scene.render.method != Method::Map && !is_bound;
         let why = match of_volumes.first() {
+            _ if races => "the first to draw: no race was run yet".to_owned(),
+            _ if wanted == Method::Auto && is_bound => "only smooth methods have render.until and render.budget".to_owned(),
             _ if !is_flat => "the flow has three dimensions".to_owned(),
             None => "the flow has two dimensions; two_level draws it as a volume".to_owned(),
             Some(key) => format!("the scene sets {key}, which a map of the flow has not"),
@@ -242,7 +250,8 @@ fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Deci
         let accepted = "another method with a flow of three dimensions, of which the command map draws a level";
         return Err(Refused::new("render.method", "is \"map\"", accepted));
     }
-    Ok(scene.render.check()?)
+    scene.render.check()?;
+    Ok(races)
 }
 
 /// The keys of the scene that only a picture of a volume has.

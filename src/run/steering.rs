@@ -289,6 +289,14 @@ impl Steering {
         }
     }
 
+    /// The run draws by another method, unless a command asks for one.
+    pub(super) fn keep_method(&self, method: Method) {
+        let mut state = self.lock();
+        if state.pending.iter().all(|command| command.set.method.is_none()) {
+            state.method = method;
+        }
+    }
+
     /// Refuses a method that this run cannot take.
     fn check_method(&self, method: Method) -> Result<(), Refused> {
         let began = self.render.method;

@@ -1,4 +1,4 @@
-//! Charts, trials and offline training through the command line.
+//! Charts and offline training through the command line.
 
 #![allow(clippy::unwrap_used)]
 
@@ -95,8 +95,11 @@ fn pictures_converge_and_the_chart_is_drawn() {
     let mean_square = |psnr: &str| compared.iter().map(|frame| 10f64.powf(-0.1 * number(&frame[psnr]))).sum::<f64>();
     let ratio = mean_square("stated_psnr") / mean_square("psnr");
     assert!(10.0 * ratio.log10().abs() < 2.5, "stated over measured mean square: {ratio} in {compared:?}");
-    let chosen = chart["pictures"]["auto"]["curve"].as_str().unwrap();
-    assert!(["two_level, table", "marched, table", "reference"].contains(&chosen), "auto: {chosen}");
+    let race = &chart["pictures"]["race"];
+    let times: Vec<&str> = race["seconds"].as_array().unwrap().iter().map(|time| time[0].as_str().unwrap()).collect();
+    assert!(times == ["two_level", "marched", "reference"] && times.contains(&race["method"].as_str().unwrap()), "{race}");
+    let verdict = chart["verdict"].to_string();
+    assert!(verdict.contains("begins with two_level, table: "), "{verdict}");
     let steps: Vec<f64> =
         chart["scaling"]["points"].as_array().unwrap().iter().filter(|p| p["axis"] == "tau").map(|p| number(&p["steps"])).collect();
     assert!(steps.len() >= 2 && steps[0] < steps[steps.len() - 1], "a longer tau takes more steps: {steps:?}");
@@ -107,38 +110,6 @@ fn pictures_converge_and_the_chart_is_drawn() {
     for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "Double gyre"] {
         assert!(svg.contains(words), "{words}");
     }
-}
-
-#[test]
-fn a_trial_is_remembered_beside_its_scene() {
-    let folder = tempfile::tempdir().unwrap();
-    let scene = folder.path().join("scene.toml");
-    std::fs::copy(config("double_gyre.toml"), &scene).unwrap();
-    let keys: Vec<&str> = SMALL.iter().flat_map(|key| ["--set", key]).collect();
-    let picture = folder.path().join("picture.exr");
-    let render = |more: &[&str]| {
-        let given = ["render", text(&scene), "--device", "cpu", "--method", "auto", "--out", text(&picture), "--json"];
-        run(&mut ridgewatch(given.iter().chain(&keys).chain(more))).success()
-    };
-    let first = render(&[]);
-    let choice = json(&folder.path().join("scene.auto.json"));
-    let method = choice["choice"]["method"].as_str().unwrap().to_owned();
-    assert!(
-        ["two_level", "marched", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")),
-        "{}",
-        first.stderr
-    );
-    assert_eq!(serde_json::from_str::<Value>(&first.stdout).unwrap()["method"], method.as_str(), "the record has what rendered");
-    // Another choice in the file shows that it is read, and another scene that it is not.
-    let other = if method == "reference" { "two_level" } else { "reference" };
-    let mut changed = choice.clone();
-    changed["choice"]["method"] = other.into();
-    std::fs::write(folder.path().join("scene.auto.json"), changed.to_string()).unwrap();
-    assert_eq!(serde_json::from_str::<Value>(&render(&[]).stdout).unwrap()["method"], other);
-    let again = render(&["--set", "time.tau=5.5"]);
-    let remembered = json(&folder.path().join("scene.auto.json"));
-    assert_ne!(remembered["asked"], choice["asked"]);
-    assert_eq!(serde_json::from_str::<Value>(&again.stdout).unwrap()["method"], remembered["choice"]["method"], "of another trial");
 }
 
 #[test]

@@ -66,9 +66,9 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
 }
 
 /// Slides of a double gyre that turns at another speed in each.
-struct Gusts {
-    first: Slide,
-    speeds: std::vec::IntoIter<f64>,
+pub struct Gusts {
+    pub first: Slide,
+    pub speeds: std::vec::IntoIter<f64>,
 }
 
 impl Slides for Gusts {

@@ -1,0 +1,337 @@
+//! Races of methods, for `render.method = "auto"`.
+//!
+//! A run begins with `two_level`, so that no picture waits for a race, or with the method that won an earlier run's. At the end of a slide the others draw
+//! pictures that are not shown. A race is run as soon as it takes at most a tenth of the time since the one before, and again when the character of the
+//! window has changed.
+
+use super::cycle::{Cycle, Run, Sink};
+use super::decision::Decision;
+use super::slides::{Slide, Slides};
+use super::steering::drawn_by;
+use super::stop::{RunEnd, check_stop};
+use super::transaction::{On, present, with};
+use super::{Event, FrameRecord};
+use crate::backend::{Backend, FrameJob, Rendered, Routing, Surrogate};
+use crate::render::{Method, noise_psnr};
+use crate::surrogate::Kind;
+use serde::{Deserialize, Serialize};
+use std::time::Instant;
+
+/// PSNR over lit pixels, in decibels, to which the methods race.
+const TARGET: f64 = 40.0;
+/// Times that differ by less than this factor count as equal.
+const MARGIN: f64 = 1.1;
+/// Largest share of the time that goes into races.
+const SHARE: f64 = 0.1;
+/// Factor by which the time to the target changes if the character of the window does, and slides in a row that show it.
+const CHANGED: f64 = 2.0;
+const IN_A_ROW: usize = 3;
+/// Seconds by which a frame may take longer for other reasons.
+const NOISE: f64 = 0.01;
+/// The methods that race, in the order in which they are taken if they are equally fast: `two_level` goes on from there.
+const METHODS: [Method; 3] = [Method::TwoLevel, Method::Marched, Method::Reference];
+/// Samples a pixel of a picture in a race.
+const SAMPLES: f64 = 2.0;
+/// Pictures of a method in a race. Two tell the noise of a method that states no error.
+const PICTURES: usize = 2;
+/// Number of the first picture of a race.
+const RACE_PICTURE: u64 = 1 << 42;
+
+/// Result of a race.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Race {
+    /// The method that reaches the target first; one that stands before it in the order `two_level`, `marched`, `reference` if that takes at most 10 %
+    /// longer.
+    pub method: Method,
+    /// Seconds since a slide to the target, by method; extrapolated if fewer pictures were drawn. `None` for methods that never reach it.
+    pub seconds: Vec<(Method, Option<f64>)>,
+    /// The target, in decibels over lit pixels.
+    pub target: f64,
+    /// The slide at whose end it was run.
+    pub slide: u64,
+}
+
+/// What a method takes for a slide.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Pace {
+    /// Seconds of preparing the slide.
+    prepared: f64,
+    frames: usize,
+    /// Seconds of all frames, and of the last one.
+    drawn: f64,
+    last: f64,
+    /// PSNR of the last frame, in decibels; `None` if the method states none.
+    psnr: Option<f64>,
+}
+
+/// The races of a run.
+#[derive(Debug)]
+pub(super) struct Races {
+    is_due: bool,
+    /// End of the last race, or begin of the run.
+    since: Instant,
+    /// Figure of the drawn method in the slide after the last race, and slides in a row that differ from it.
+    then: Option<f64>,
+    differ: usize,
+    /// Races so far.
+    count: u64,
+}
+
+impl Race {
+    /// Of the seconds from a slide to a PSNR in decibels, by method; `None` if no method reaches the target.
+    pub fn of_times(seconds_to: impl Fn(Method, f64) -> Option<f64>) -> Option<Self> {
+        let seconds: Vec<_> = METHODS.into_iter().map(|method| (method, seconds_to(method, TARGET))).collect();
+        seconds.iter().any(|(_, seconds)| seconds.is_some()).then(|| Self::of(seconds, 0))
+    }
+
+    /// Of the times of all methods.
+    fn of(seconds: Vec<(Method, Option<f64>)>, slide: u64) -> Self {
+        let best = seconds.iter().filter_map(|(_, seconds)| *seconds).fold(f64::INFINITY, f64::min);
+        let as_fast = |(_, seconds): &&(Method, Option<f64>)| seconds.is_some_and(|seconds| seconds <= MARGIN * best);
+        let method = seconds.iter().find(as_fast).map_or(Method::TwoLevel, |(method, _)| *method);
+        Self { method, seconds, target: TARGET, slide }
+    }
+
+    /// The times that decided.
+    pub fn why(&self) -> String {
+        let time = |seconds: &Option<f64>| match seconds.filter(|seconds| seconds.is_finite()) {
+            Some(seconds) if seconds < 10.0 => format!("{seconds:.2} s"),
+            Some(seconds) => format!("{seconds:.0} s"),
+            None => "never".to_owned(),
+        };
+        let times: Vec<String> = self.seconds.iter().map(|(method, seconds)| format!("{} {}", method.name(), time(seconds))).collect();
+        format!("first to {} dB after a slide ({})", self.target, times.join(", "))
+    }
+}
+
+impl Pace {
+    /// Adds a frame.
+    pub(super) fn add(&mut self, record: &FrameRecord) {
+        self.prepared += record.seconds.slide;
+        // A march does not improve, so that it must be sure to be there.
+        let stated = |error: &crate::render::smooth::PictureError| {
+            if record.method == Method::Marched.name() { error.psnr.low } else { error.psnr.value }
+        };
+        self.draw(record.seconds.total, record.picture_error.as_ref().map(stated));
+    }
+
+    fn draw(&mut self, seconds: f64, psnr: Option<f64>) {
+        (self.frames, self.drawn, self.last, self.psnr) = (self.frames + 1, self.drawn + seconds, seconds, psnr);
+    }
+
+    /// Seconds since the slide to a PSNR: those taken, or extrapolated as if the squared error fell in proportion to the number of frames. `None` for a
+    /// march below it, whose error samples do not lower, and without a PSNR.
+    fn seconds_to(&self, target: f64, method: Method) -> Option<f64> {
+        let psnr = self.psnr.filter(|psnr| method != Method::Marched || *psnr >= target)?;
+        let more = self.frames as f64 * (10f64.powf((target - psnr) / 10.0) - 1.0).max(0.0);
+        Some(self.prepared + self.drawn + more * self.last)
+    }
+
+    /// What tells that the character of the window changed: the time to the target, or that of a frame of a method that states no error.
+    fn figure(&self, method: Method) -> f64 {
+        self.seconds_to(TARGET, method).unwrap_or(self.last)
+    }
+}
+
+impl Races {
+    /// Races of a run that begins now, after an earlier run's race.
+    pub(super) fn new(earlier: Option<&Race>) -> Self {
+        Self { is_due: earlier.is_none(), since: Instant::now(), then: None, differ: 0, count: 0 }
+    }
+
+    /// The flow map or the colours are other ones.
+    pub(super) fn begin_anew(&mut self) {
+        self.is_due = true;
+    }
+
+    /// Looks at a slide by the method that draws.
+    fn look_at(&mut self, method: Method, pace: &Pace) {
+        let figure = pace.figure(method) + NOISE;
+        let then = *self.then.get_or_insert(figure);
+        self.differ = if figure > CHANGED * then || then > CHANGED * figure { self.differ + 1 } else { 0 };
+        self.is_due |= self.differ >= IN_A_ROW;
+    }
+
+    /// Whether a race is due that takes so many seconds.
+    fn allow(&self, seconds: f64) -> bool {
+        self.is_due && seconds <= SHARE * self.since.elapsed().as_secs_f64()
+    }
+}
+
+impl Run<'_> {
+    /// Whether a surrogate is kept for the method, or for those that a command may choose.
+    pub(super) fn keeps_surrogate(&self) -> bool {
+        let scene = &self.plan.scene;
+        // What was learned is kept; a table is traced again within a slide.
+        let may_go = self.races.is_some() && scene.surrogate.kind == Kind::Table;
+        scene.render.method.has_surrogate() && (self.render.method.has_surrogate() || !may_go)
+    }
+
+    /// Draws pictures by a method that are not shown, into the session's picture, which is empty.
+    fn try_method<B: Backend>(&mut self, on: &mut On<B>, method: Method) -> Result<Pace, RunEnd> {
+        let gate = self.gate(method);
+        let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
+        let frozen = serves.map(Surrogate::freeze).transpose()?;
+        let smooth = self.smooth(&on.backend, serves, method, SAMPLES)?;
+        let routing = Routing { gate: &gate, trace_budget: self.plan.scene.trust.trace_budget, keep: 0, extras: self.label_extras() };
+        let first = RACE_PICTURE + (self.races.as_ref().map_or(0, |races| races.count) << 8);
+        let On { backend, tracer, picture, .. } = on;
+        let mut renderer = self.renderer.clone();
+        let (mut pace, mut before) = (Pace::default(), None);
+        for number in 0..PICTURES as u64 {
+            let job = FrameJob {
+                tracer: present(tracer),
+                surrogate: frozen.as_ref(),
+                routing,
+                picture: first + number,
+                samples: SAMPLES,
+                smooth,
+                is_map: false,
+                progress: None,
+                stop: self.stop,
+            };
+            let begin = Instant::now();
+            let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer, picture))?;
+            let seconds = begin.elapsed().as_secs_f64();
+            check_stop(self.stop)?;
+            let Rendered { film, error, .. } = rendered;
+            let stated = error.map(|error| if method == Method::Marched { error.psnr.low } else { error.psnr.value });
+            let tone_map = self.render.tone_map_of(method);
+            let told = before.replace(film.clone()).map(|before| noise_psnr(&before, &film, tone_map));
+            pace.draw(seconds, stated.or(told));
+            if method == Method::Marched {
+                break;
+            }
+        }
+        *picture = Default::default();
+        Ok(pace)
+    }
+}
+
+impl<B: Backend> Cycle<'_, B> {
+    /// Lets the methods race at the end of a slide, if a race is due and another slide comes.
+    pub(super) fn race(&mut self, slides: &dyn Slides, slide: &Slide, pace: &Pace, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+        let run = &mut self.run;
+        let drawn = run.render.method;
+        let Some(races) = run.races.as_mut().filter(|_| pace.frames > 0) else { return Ok(()) };
+        races.look_at(drawn, pace);
+        let has_surrogate = with!(&self.session, on => on.surrogate.is_some());
+        let tracing = if has_surrogate { 0.0 } else { run.progress.surrogate_seconds };
+        let pictures = (METHODS.len() * PICTURES) as f64 * pace.last;
+        if slides.is_over() || slides.is_awaited() == Some(false) || !races.allow(tracing + pictures) {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        with!(&mut self.session, on => on.picture = Default::default());
+        let mut seconds = Vec::new();
+        for method in METHODS {
+            seconds.push((method, self.time_of(slide, method, pace)?));
+        }
+        let race = Race::of(seconds, slide.index);
+        let run = &mut self.run;
+        if race.method != drawn {
+            // Comes after the frames that it explains.
+            sink(Event::Note(format!(
+                "render.method = \"auto\": {} from slide {} on, {}",
+                race.method.name(),
+                slide.index + 1,
+                race.why()
+            )));
+            run.render = drawn_by(&run.plan.scene.render, race.method, run.plan.scene.render.budget);
+            run.progress.seconds_per_sample = None;
+            run.draw_color_bar();
+            run.options.steering.iter().for_each(|steering| steering.keep_method(race.method));
+        }
+        Decision::new("render.method", race.method.name(), race.why()).enter(&mut run.report.decisions);
+        if !run.keeps_surrogate() {
+            with!(&mut self.session, on => on.surrogate = None);
+            run.learning.resize = None;
+        }
+        run.report.race = Some(race);
+        if let Some(races) = &mut run.races {
+            *races = Races { is_due: false, count: races.count + 1, ..Races::new(None) };
+        }
+        run.progress.raced += begin.elapsed().as_secs_f64();
+        Ok(())
+    }
+
+    /// Seconds from a slide to the target by a method, which draws pictures of its own: those of the slide may be single ones, whose first costs most.
+    /// `None` if it never reaches it, or the device has no room for it.
+    fn time_of(&mut self, slide: &Slide, method: Method, drawn: &Pace) -> Result<Option<f64>, RunEnd> {
+        let serves = method.has_surrogate();
+        let tried = with!(&mut self.session, on => {
+            let built = if serves && on.surrogate.is_none() { self.run.build_surrogate(on) } else { Ok(()) };
+            built.and_then(|()| self.run.try_method(on, method))
+        });
+        match tried {
+            Ok(pace) => {
+                // All but the surrogate is prepared alike.
+                let surrogate = self.run.progress.surrogate_seconds;
+                let others = if self.run.render.method.has_surrogate() { (drawn.prepared - surrogate).max(0.0) } else { drawn.prepared };
+                let prepared = if serves { others + surrogate } else { others };
+                Ok(Pace { prepared, ..pace }.seconds_to(TARGET, method))
+            }
+            Err(RunEnd::Device(error)) => {
+                tracing::info!("{} does not race: {error}", method.name());
+                if !error.is_refusal() {
+                    self.session.recover(error, slide, &self.map, &mut self.run)?;
+                }
+                Ok(None)
+            }
+            Err(end) => Err(end),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_extrapolated_as_noise_falls() {
+        let mut pace = Pace { prepared: 1.0, ..Pace::default() };
+        assert_eq!(pace.seconds_to(40.0, Method::TwoLevel), None, "without a frame");
+        for _ in 0..4 {
+            pace.draw(0.5, Some(30.0));
+        }
+        let seconds = pace.seconds_to(40.0, Method::TwoLevel).unwrap();
+        assert!((seconds - (1.0 + 2.0 + 36.0 * 0.5)).abs() < 1e-9, "ten times as many frames: {seconds}");
+        assert_eq!(pace.seconds_to(30.0, Method::TwoLevel), Some(3.0), "those taken");
+        assert_eq!(
+            (pace.seconds_to(40.0, Method::Marched), pace.seconds_to(30.0, Method::Marched)),
+            (None, Some(3.0)),
+            "it does not improve"
+        );
+    }
+
+    #[test]
+    fn equal_times_keep_the_order() {
+        let race = |times: [Option<f64>; 3]| Race::of(METHODS.into_iter().zip(times).collect(), 0).method;
+        assert_eq!(race([Some(1.09), Some(1.0), Some(1.0)]), Method::TwoLevel);
+        assert_eq!(race([Some(1.2), Some(1.05), Some(1.0)]), Method::Marched);
+        assert_eq!(race([Some(1.2), None, Some(1.0)]), Method::Reference);
+        assert_eq!(race([None; 3]), Method::TwoLevel);
+        let race = Race::of(vec![(Method::TwoLevel, Some(0.5)), (Method::Marched, None), (Method::Reference, Some(120.0))], 0);
+        assert_eq!(race.why(), "first to 40 dB after a slide (two_level 0.50 s, marched never, reference 120 s)");
+    }
+
+    #[test]
+    fn a_race_takes_a_tenth_of_the_time_and_comes_again_when_the_window_changes() {
+        let pace = |seconds: f64| Pace { prepared: 0.0, frames: 1, drawn: seconds, last: seconds, psnr: Some(40.0) };
+        let mut races = Races { since: Instant::now() - std::time::Duration::from_secs(100), ..Races::new(None) };
+        races.look_at(Method::TwoLevel, &pace(1.0));
+        assert_eq!((races.allow(9.9), races.allow(10.2)), (true, false));
+        (races.is_due, races.then) = (false, None);
+        for (seconds, is_due) in
+            [(1.0, false), (1.9, false), (2.1, false), (0.4, false), (1.9, false), (2.1, false), (2.1, false), (0.4, true)]
+        {
+            races.look_at(Method::TwoLevel, &pace(seconds));
+            assert_eq!(races.allow(1.0), is_due, "{seconds}");
+        }
+        let mut slower = Races { is_due: false, then: Some(1.0), differ: 0, ..races };
+        (0..3).for_each(|_| slower.look_at(Method::Reference, &Pace { psnr: None, ..pace(0.4) }));
+        assert!(slower.is_due, "a method without a stated error is judged by its frames");
+        let earlier = Race::of(vec![(Method::TwoLevel, Some(1.0))], 0);
+        assert!(!Races::new(Some(&earlier)).is_due, "an earlier run's race counts");
+    }
+}
