@@ -109,6 +109,7 @@ fn panels(chart: &Chart) -> Vec<Panel> {
         }
     }
     panels.extend(chart.pictures.as_ref().filter(|panel| !panel.curves.is_empty()).map(picture_panel));
+    panels.extend(chart.pictures.as_ref().and_then(sliding_panel));
     panels.extend(chart.scaling.as_ref().and_then(|panel| scaling_panel(panel, &chart.time_unit)));
     panels
 }
@@ -155,6 +156,25 @@ fn picture_panel(panel: &PicturePanel) -> Panel {
         pick: None,
         levels: [35.0, 40.0].map(|level| (level, format!("{level} dB"))).to_vec(),
     }
+}
+
+/// Pictures of a window that slides at every frame; `None` if none was measured.
+fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
+    let series = panel.curves.iter().filter_map(|curve| {
+        let sliding = curve.sliding?;
+        Some(Series { name: curve.name(), points: vec![(1.0 / sliding.frames_per_second, sliding.psnr?)], is_line: false })
+    });
+    let series: Vec<Series> = series.collect();
+    (!series.is_empty()).then(|| Panel {
+        title: "Pictures: error against time of a frame, window that slides at every frame".into(),
+        x: "seconds per frame, preparation and training included".into(),
+        y: "PSNR over lit pixels, dB".into(),
+        is_y_log: false,
+        series,
+        front: Vec::new(),
+        pick: None,
+        levels: [35.0, 40.0].map(|level| (level, format!("{level} dB"))).to_vec(),
+    })
 }
 
 /// Costs against tau; the other axes are in the verdict and in the CSV.
@@ -268,7 +288,7 @@ where
         }
     }
     plot.draw_series(LineSeries::new(panel.front.iter().map(|(x, y, _)| (*x, *y)), BLACK.stroke_width(1))).map_err(plot_error)?;
-    let mut drawn: Vec<(i32, i32)> = Vec::new();
+    let mut drawn: Vec<(i32, i32)> = panel.levels.iter().map(|(level, _)| plot.backend_coord(&(x0 * 1.05, *level))).collect();
     for (x, y, label) in &panel.front {
         // A label that would lie on another one is left out; the table has them all.
         let (across, down) = plot.backend_coord(&(*x, *y));

@@ -1,8 +1,8 @@
 //! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
 
 use super::slides::FirstSlides;
-use super::with_method;
-use super::{Charting, device_name, failed};
+use super::verdict::CHARGED;
+use super::{Charting, device_name, failed, front, pick, with_method};
 use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
@@ -34,6 +34,9 @@ const MIN_BATCH: usize = 1 << 12;
 const MAX_BATCH: [usize; 2] = [1 << 20, 1 << 23];
 /// Seconds for which networks are trained before each measurement.
 const TRAINED: [f64; 3] = [1.0, 3.0, 10.0];
+/// What is said of methods that ran on the CPU in a chart of a GPU.
+#[cfg(feature = "cuda")]
+const ON_THE_CPU: &str = ", on the CPU";
 /// Seconds of tracing labels for networks, and most labels.
 const LABELS_SECONDS: f64 = 2.0;
 const MAX_LABELS: usize = 1 << 24;
@@ -88,6 +91,28 @@ pub struct FtlePanel {
     pub chosen_steps: Option<usize>,
     /// All methods and settings.
     pub methods: Vec<FtlePoint>,
+    /// Pareto fronts of error and seconds, building included.
+    pub fronts: Vec<Front>,
+}
+
+/// The methods that no other beats in error and seconds at once.
+#[derive(Debug, Clone, Serialize)]
+pub struct Front {
+    /// Number of samples.
+    pub samples: f64,
+    /// Places in the list of methods, from the cheapest to the most exact.
+    pub methods: Vec<usize>,
+    /// Place of the cheapest within the tolerance; `None` if none is.
+    pub pick: Option<usize>,
+}
+
+impl Front {
+    fn of(methods: &[FtlePoint], points: usize, tolerance: f64, samples: f64) -> Self {
+        // Points that fail are on no front.
+        let error = |point: &FtlePoint| if point.is_sound(points) { point.rms } else { f64::INFINITY };
+        let at: Vec<[f64; 2]> = methods.iter().map(|point| [point.seconds(samples), error(point)]).collect();
+        Self { samples, methods: front(&at), pick: pick(&at, tolerance) }
+    }
 }
 
 /// The first slide of a scene.
@@ -102,6 +127,12 @@ pub(super) struct Opened {
 }
 
 impl Opened {
+    /// The same with another velocity.
+    pub(super) fn over(&self, velocity: VelocitySource) -> Self {
+        let (plan, slide, device_name) = (self.plan.clone(), Slide { velocity, ..self.slide.clone() }, self.device_name.clone());
+        Self { plan, slide, device_name, ..*self }
+    }
+
     pub(super) fn new(settings: &Settings, device: &Device, slides: &FirstSlides) -> Result<Self, RunError> {
         /// Intervals of a composed flow map of a closed form.
         const CLOSED: usize = 10;
@@ -192,6 +223,8 @@ struct Bench<'a, 'b> {
     timed: Points,
     /// Bytes of the window as the backend in use stores it.
     window_bytes: u64,
+    /// Nodes that are traced a second; `None`: as many as the chosen steps trace samples.
+    nodes_per_second: Option<f64>,
     found: Vec<FtlePoint>,
 }
 
@@ -299,7 +332,8 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
     let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
     let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
-    let mut bench = Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, found: Vec::new() };
+    let mut bench =
+        Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, nodes_per_second: None, found: Vec::new() };
     let steps = chosen_steps.or(match opened.plan.map.steps {
         Steps::Fixed(steps) => Some(steps),
         Steps::Auto { .. } | Steps::AutoByShare { .. } => None,
@@ -310,8 +344,8 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             tracing(&mut bench, &mut Cpu, steps, "")?;
             tables(&mut bench, &mut Cpu)?;
             differences(&mut bench, &mut Cpu, steps)?;
-            composed(&mut bench, steps)?;
-            adaptive(&mut bench)?;
+            composed(&mut bench, steps, "")?;
+            adaptive(&mut bench, "")?;
             networks(&mut bench, &mut Cpu)?;
         }
         #[cfg(feature = "cuda")]
@@ -327,16 +361,23 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             }
             tables(&mut bench, &mut backend)?;
             differences(&mut bench, &mut backend, steps)?;
+            // They have no kernels.
+            let chosen = FlowMap { steps: Steps::Fixed(steps), ..opened.plan.map.clone() };
+            bench.time_nodes_by(&*opened.on_cpu(&chosen)?);
+            composed(&mut bench, steps, ON_THE_CPU)?;
+            adaptive(&mut bench, ON_THE_CPU)?;
+            bench.nodes_per_second = None;
             networks(&mut bench, &mut backend)?;
-            bench.charting.skip("composed flow maps, and Dormand-Prince over tolerances", "they run on the CPU only");
         }
     }
+    let (points, tolerance) = (bench.points.unit.len(), opened.plan.scene.trust.tolerance * ramp);
     Ok(FtlePanel {
-        points: bench.points.unit.len(),
+        points,
         truth: "Dormand-Prince 5(4), f64, tolerance 1e-10".into(),
         truth_rms,
-        tolerance: opened.plan.scene.trust.tolerance * ramp,
+        tolerance,
         chosen_steps,
+        fronts: CHARGED.map(|samples| Front::of(&bench.found, points, tolerance, samples)).to_vec(),
         methods: bench.found,
     })
 }
@@ -426,19 +467,19 @@ fn differences<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: us
 }
 
 /// Dormand-Prince over tolerances, on the CPU.
-fn adaptive(bench: &mut Bench<'_, '_>) -> Result<(), RunError> {
+fn adaptive(bench: &mut Bench<'_, '_>, place: &str) -> Result<(), RunError> {
     for tolerance in [1e-4, 1e-2, 1e-6, 1e-8] {
         if bench.charting.has_time_for(&format!("Dormand-Prince, tolerance {tolerance:e}")) {
             let (velocity, map, time) = (bench.opened.slide.velocity.clone(), &bench.opened.plan.map, bench.opened.slide.time);
             let tracer = dormand_prince_tracer(velocity, map, time, tolerance).map_err(RunError::Flow)?;
-            bench.measure_tracer("Dormand-Prince, f64", format!("tolerance {tolerance:e}"), &tracer)?;
+            bench.measure_tracer(&format!("Dormand-Prince, f64{place}"), format!("tolerance {tolerance:e}"), &tracer)?;
         }
     }
     Ok(())
 }
 
 /// Composed flow maps, plain and joined, over resolutions, on the CPU.
-fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
+fn composed(bench: &mut Bench<'_, '_>, steps: usize, place: &str) -> Result<(), RunError> {
     let own = bench.opened.own_nodes(false);
     let intervals = bench.opened.intervals;
     for factor in [0.5, 1.0, 2.0] {
@@ -473,7 +514,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
                 of(unit);
                 Ok(began.elapsed().as_secs_f64())
             };
-            bench.measure(name, format!("{} nodes", shape(nodes)), built, |points| Ok(of(&points.unit)), seconds)?;
+            bench.measure(&format!("{name}{place}"), format!("{} nodes", shape(nodes)), built, |points| Ok(of(&points.unit)), seconds)?;
         }
     }
     Ok(())
@@ -557,6 +598,16 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
 }
 
 impl Bench<'_, '_> {
+    /// Nodes are traced by this tracer of the CPU from now on.
+    #[cfg(feature = "cuda")]
+    fn time_nodes_by(&mut self, tracer: &dyn Tracer) {
+        let (_, seeds) = self.timed.first(MIN_BATCH);
+        let mut traced = Traced::default();
+        let began = Instant::now();
+        self.charting.pool.install(|| tracer.trace(seeds, Extras::default(), &mut traced));
+        self.nodes_per_second = Some(seeds.len() as f64 / began.elapsed().as_secs_f64());
+    }
+
     /// Traces uniform random labels for some seconds; returns them with the seconds.
     fn labels(&mut self, tracer: &dyn Trace) -> Result<(ReplayBuffer, f64), RunError> {
         let extras = self.opened.plan.scene.network.label_extras();
@@ -608,7 +659,8 @@ fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize, values: usize) -> b
         return false;
     }
     // The first one has the chosen steps.
-    let traced = bench.found.iter().find(|point| point.method.starts_with("tangent")).map_or(1e4, |point| point.samples_per_second);
+    let chosen = bench.found.iter().find(|point| point.method.starts_with("tangent")).map_or(1e4, |point| point.samples_per_second);
+    let traced = bench.nodes_per_second.unwrap_or(chosen);
     let seconds = nodes as f64 / traced;
     if values > MAX_VALUES {
         bench.charting.skip(what, format_args!("it would take {:.1} GiB", values as f64 / f64::from(1 << 28)));

@@ -18,7 +18,7 @@ mod verdict;
 
 pub use draw::{DrawError, write_png, write_svg};
 pub use front::{front, pick};
-pub use ftle::{FtlePanel, FtlePoint};
+pub use ftle::{Front, FtlePanel, FtlePoint};
 pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};
 pub use scaling::{ScalingPanel, ScalingPoint};
 pub use still::fixed_colours;

@@ -1,4 +1,4 @@
-//! Cost of a sample against the size of the task: tau, nodes of the window, threads.
+//! Cost of a sample against the size of the task: tau, snapshots and nodes of the window, threads.
 
 use super::ftle::Opened;
 use super::slides::FirstSlides;
@@ -6,22 +6,25 @@ use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, DeviceError, Surrogate as _, SurrogateRequest};
-use crate::flow::{FlowMap, Traced};
+use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer, VelocitySource};
 use crate::run::RunError;
 use crate::source::SourceKind;
 use crate::surrogate::network::NetworkSettings;
 use crate::surrogate::{Kind, Predict, SurrogateSettings, Trace};
 use serde::Serialize;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// Points of a timed batch.
 const BATCH: [usize; 2] = [1 << 16, 1 << 21];
+/// Points on which windows are compared.
+const COMPARED: usize = 1 << 13;
 
 /// Costs at one size of the task.
 #[derive(Debug, Clone, Serialize)]
 pub struct ScalingPoint {
-    /// `tau`, `nodes` or `threads`.
+    /// `tau`, `snapshots`, `nodes` or `threads`.
     pub axis: &'static str,
     /// Value on the axis; of `nodes` the number of all nodes.
     pub value: f64,
@@ -35,6 +38,8 @@ pub struct ScalingPoint {
     pub table_seconds: f64,
     /// Samples from which on the table is cheaper, its tracing included; `None` if it never is.
     pub table_pays_from: Option<f64>,
+    /// Of `snapshots`: root mean square difference of the FTLE from that of all of them, 1/time.
+    pub rms: Option<f64>,
 }
 
 /// Costs against the size of the task.
@@ -53,6 +58,16 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
     for factor in longest {
         let map = FlowMap { tau: tau * factor, ..opened.plan.map.clone() };
         points.extend(point(charting, opened, &map, "tau", tau * factor)?);
+    }
+    if let VelocitySource::Window(window) = &opened.slide.velocity {
+        let count = window.snapshots().len();
+        for stride in [4, 2].into_iter().filter(|stride| 2 * stride < count) {
+            let thinned = window.thinned(stride, window.span().max(tau));
+            let snapshots = thinned.snapshots().len() as f64;
+            let other = opened.over(VelocitySource::Window(Arc::new(thinned)));
+            let rms = Some(charting.pool.install(|| difference(opened, &other))?);
+            points.extend(point(charting, &other, &opened.plan.map, "snapshots", snapshots)?.map(|point| ScalingPoint { rms, ..point }));
+        }
     }
     if let (SourceKind::Turbulence, Some(nodes)) = (charting.settings.source.kind, opened.shape()) {
         for factor in [0.5, 0.25] {
@@ -76,6 +91,22 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
         }
     }
     Ok(ScalingPanel { points })
+}
+
+/// Root mean square difference of the FTLE in two windows, with as many steps, where both have one.
+fn difference(whole: &Opened, thinned: &Opened) -> Result<f64, RunError> {
+    let first = whole.on_cpu(&FlowMap { steps: whole.auto_steps(), ..whole.plan.map.clone() })?;
+    let steps = if first.steps() > 0 { Steps::Fixed(first.steps()) } else { whole.plan.map.steps };
+    let second = thinned.on_cpu(&FlowMap { steps, ..whole.plan.map.clone() })?;
+    let (_, seeds) = whole.random_points(COMPARED);
+    let stretch = |tracer: &dyn Tracer| {
+        let mut traced = Traced::default();
+        tracer.trace(&seeds, Extras::default(), &mut traced);
+        traced.unrounded()
+    };
+    let (a, b) = (stretch(&*first), stretch(&*second));
+    let squares: Vec<f64> = a.iter().zip(&b).map(|(a, b)| (a - b).powi(2)).filter(|square| square.is_finite()).collect();
+    Ok((squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt() / first.tau())
 }
 
 fn point(
@@ -123,6 +154,7 @@ impl Costs {
             table_ns: 1e9 * self.table,
             table_seconds: self.table_seconds,
             table_pays_from: (saved > 0.0).then(|| self.table_seconds / saved),
+            rms: None,
         }
     }
 }

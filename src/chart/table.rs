@@ -49,7 +49,8 @@ pub fn csv(chart: &Chart) -> String {
     for point in chart.scaling.iter().flat_map(|panel| &panel.points) {
         for (method, nanoseconds, build) in [("tracing", point.trace_ns, 0.0), ("table", point.table_ns, point.table_seconds)] {
             let setting = format!("{} {}", point.axis, point.value);
-            let _ = writeln!(out, "scaling,{method},{},,{build:.6e},{:.6e},,,,,,,,,,{}", text(&setting), 1e9 / nanoseconds, point.steps);
+            let (speed, rms) = (1e9 / nanoseconds, number(point.rms));
+            let _ = writeln!(out, "scaling,{method},{},,{build:.6e},{speed:.6e},,{rms},,,,,,,,{}", text(&setting), point.steps);
         }
     }
     out

@@ -1,8 +1,8 @@
 //! What a chart says, in words.
 
-use super::ftle::{FtlePanel, FtlePoint};
+use super::Chart;
+use super::ftle::{Front, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel, RESOLVED, TARGETS};
-use super::{Chart, pick};
 use crate::render::Method;
 
 /// Numbers of samples for which building is charged.
@@ -22,8 +22,9 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             Some(samples) => format!("the table pays from {samples:.1e} samples on"),
             None => "the table never pays".into(),
         };
+        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots."));
         said.push(format!(
-            "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.",
+            "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
             point.axis,
             point.value,
             point.steps,
@@ -43,13 +44,12 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
         let errors = methods.iter().filter(|point| class.iter().any(|prefix| point.method.starts_with(prefix))).map(|point| point.rms);
         errors.fold(f64::INFINITY, f64::min)
     };
-    for samples in CHARGED {
-        let points: Vec<[f64; 2]> = methods.iter().map(|point| [point.seconds(samples), point.rms]).collect();
-        let Some(best) = pick(&points, tolerance) else {
+    for Front { samples, pick, .. } in &panel.fronts {
+        let samples = *samples;
+        let Some(best) = pick.map(|best| &panel.methods[best]) else {
             said.push(format!("No method is within {tolerance:.2e}{per}."));
             break;
         };
-        let best = methods[best];
         said.push(format!(
             "{samples:.0e} FTLE samples within {tolerance:.2e}{per}: {} takes {}, building included (rms {:.1e}, {}).",
             name(best),
@@ -57,6 +57,15 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
             best.rms,
             size(best.bytes)
         ));
+    }
+    said.extend(cheapest(methods.iter().copied().filter(|point| point.rms <= tolerance)));
+    for Front { samples, methods, .. } in panel.fronts.iter().filter(|front| front.samples == CHARGED[1]) {
+        let on = |place: &usize| {
+            let point = &panel.methods[*place];
+            format!("{} {} at {:.1e}", name(point), duration(point.seconds(*samples)), point.rms)
+        };
+        let points: Vec<String> = methods.iter().map(on).collect();
+        said.push(format!("Pareto front of {samples:.0e} samples, rms{per}: {}.", points.join("; ")));
     }
     // From how many samples on the cheapest setting of each class within the tolerance beats the fastest tracing within it.
     const TRACING: [&str; 3] = ["tangent", "differences", "Dormand-Prince"];
@@ -93,6 +102,26 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
             ),
             _ => format!("{class}: within the tolerance, and never cheaper than tracing."),
         });
+    }
+}
+
+/// Which method is the cheapest, building included, from how many samples on. `None` without any.
+fn cheapest<'a>(within: impl Iterator<Item = &'a FtlePoint>) -> Option<String> {
+    let within: Vec<&FtlePoint> = within.collect();
+    let mut best = within.iter().copied().min_by(|a, b| a.seconds(1.0).total_cmp(&b.seconds(1.0)))?;
+    let mut said = name(best);
+    let mut from = 1.0;
+    loop {
+        // Where the cost of another one, which is built for longer and faster, falls below.
+        let crossing = |point: &'a FtlePoint| {
+            let saved = 1.0 / best.samples_per_second - 1.0 / point.samples_per_second;
+            let at = (point.build_seconds - best.build_seconds) / saved;
+            (saved > 0.0 && at > from).then_some((at, point))
+        };
+        let next = within.iter().filter_map(|point| crossing(point)).min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((at, point)) = next else { return Some(format!("Cheapest within the tolerance: {said}.")) };
+        said += &format!(", from {at:.1e} samples on {}", name(point));
+        (best, from) = (point, at);
     }
 }
 
@@ -176,5 +205,30 @@ fn duration(seconds: f64) -> String {
         s if s < 600.0 => format!("{s:.2} s"),
         s if s < 36_000.0 => format!("{:.0} min", s / 60.0),
         s => format!("{:.0} h", s / 3600.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cheapest_method_changes_where_costs_cross() {
+        let point = |method: &str, build_seconds, samples_per_second| FtlePoint {
+            method: method.into(),
+            setting: "set".into(),
+            rms: 0.1,
+            p99: 0.1,
+            psnr: None,
+            samples_per_second,
+            build_seconds,
+            bytes: 0,
+            failed: 0,
+        };
+        // Costs cross at 200 (1 s against 200 / 100 - 200 / 200), and at 20,000 (100 s against 20,000 / 200 - 20,000 / 1e9).
+        let points = [point("tracing", 0.0, 100.0), point("table", 1.0, 200.0), point("dear", 500.0, 150.0), point("network", 101.0, 1e9)];
+        let said = "Cheapest within the tolerance: tracing (set), from 2.0e2 samples on table (set), from 2.0e4 samples on network (set).";
+        assert_eq!(cheapest(points.iter()).as_deref(), Some(said));
+        assert_eq!(cheapest(std::iter::empty()), None);
     }
 }

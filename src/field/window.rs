@@ -190,6 +190,18 @@ impl Window {
         self.snapshots.front().map(|s| &s.grid)
     }
 
+    /// A window over `span` of every `stride`-th snapshot and the last one, so that it still covers the time of this one.
+    pub fn thinned(&self, stride: usize, span: f64) -> Self {
+        let count = self.snapshots().len();
+        let mut thinned = Self::new(span);
+        for (_, snapshot) in self.snapshots().enumerate().filter(|(index, _)| index % stride == 0 || index + 1 == count) {
+            // Snapshots of a window are never refused.
+            let pushed = thinned.push(snapshot.clone());
+            debug_assert!(pushed.is_ok());
+        }
+        thinned
+    }
+
     /// Memory of all nodes, in bytes.
     pub fn bytes(&self) -> usize {
         self.snapshots.iter().map(|s| s.bytes()).sum()

@@ -36,14 +36,7 @@ pub fn time_resolution(window: &Arc<Window>, map: &FlowMap, t0: f64) -> Result<T
     let count = window.snapshots().len();
     let mut ftle_change = None;
     if count > 2 {
-        let mut thinned = Window::new(window.span().max(map.tau));
-        for (index, snapshot) in window.snapshots().enumerate() {
-            // The last snapshot stays, so that the window still covers the integration. Snapshots of a window are never refused.
-            if index % 2 == 0 || index + 1 == count {
-                let pushed = thinned.push(snapshot.clone());
-                debug_assert!(pushed.is_ok());
-            }
-        }
+        let thinned = window.thinned(2, window.span().max(map.tau));
         let mut half = Traced::default();
         cpu_tracer(VelocitySource::Window(Arc::new(thinned)), map, t0)?.trace(&points, Extras::default(), &mut half);
         ftle_change = Some(steps::rms_difference(&all, &half) / map.tau);

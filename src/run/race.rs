@@ -316,6 +316,13 @@ mod tests {
     }
 
     #[test]
+    fn a_race_by_measured_times_needs_one_that_reached_the_target() {
+        let race = Race::of_times(|method, target| (target == 40.0 && method == Method::Reference).then_some(2.0));
+        assert!(race.is_some_and(|race| race.method == Method::Reference && race.slide == 0));
+        assert_eq!(Race::of_times(|_, _| None), None);
+    }
+
+    #[test]
     fn a_race_takes_a_tenth_of_the_time_and_comes_again_when_the_window_changes() {
         let pace = |seconds: f64| Pace { prepared: 0.0, frames: 1, drawn: seconds, last: seconds, psnr: Some(40.0) };
         let mut races = Races { since: Instant::now() - std::time::Duration::from_secs(100), ..Races::new(None) };

@@ -55,6 +55,13 @@ fn errors_fall_with_steps_and_nodes() {
     let verdict = chart["verdict"][0].as_str().unwrap();
     let name = format!("{} ({})", best["method"].as_str().unwrap(), best["setting"].as_str().unwrap());
     assert!(verdict.starts_with("1e6 FTLE samples") && verdict.contains(&name), "{verdict}; {name}");
+    let front = &chart["ftle"]["fronts"][0];
+    assert_eq!(methods[front["pick"].as_u64().unwrap() as usize], *best);
+    let of_front: Vec<f64> =
+        front["methods"].as_array().unwrap().iter().map(|n| number(&methods[n.as_u64().unwrap() as usize]["rms"])).collect();
+    assert!(of_front.windows(2).all(|pair| pair[1] < pair[0]), "from the cheapest to the most exact: {of_front:?}");
+    let said = chart["verdict"].to_string();
+    assert!(said.contains("Pareto front of 1e9 samples") && said.contains("Cheapest within the tolerance: "), "{said}");
     // One line per measurement below the head.
     let csv = std::fs::read_to_string(out.join("chart.csv")).unwrap();
     assert_eq!(csv.lines().count(), methods.len() + 1);
@@ -95,9 +102,10 @@ fn pictures_converge_and_the_chart_is_drawn() {
     let mean_square = |psnr: &str| compared.iter().map(|frame| 10f64.powf(-0.1 * number(&frame[psnr]))).sum::<f64>();
     let ratio = mean_square("stated_psnr") / mean_square("psnr");
     assert!(10.0 * ratio.log10().abs() < 2.5, "stated over measured mean square: {ratio} in {compared:?}");
+    // The coarse table may keep all of them below 40 dB, and then there is no race.
+    let last = |method: &str| number(&frames(method).last().unwrap()["psnr"]);
     let race = &chart["pictures"]["race"];
-    let times: Vec<&str> = race["seconds"].as_array().unwrap().iter().map(|time| time[0].as_str().unwrap()).collect();
-    assert!(times == ["two_level", "marched", "reference"] && times.contains(&race["method"].as_str().unwrap()), "{race}");
+    assert_eq!(race.is_null(), ["two_level", "marched", "reference"].iter().all(|method| last(method) < 40.0), "{race}");
     let verdict = chart["verdict"].to_string();
     assert!(verdict.contains("begins with two_level, table: "), "{verdict}");
     let steps: Vec<f64> =
@@ -110,6 +118,25 @@ fn pictures_converge_and_the_chart_is_drawn() {
     for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "Double gyre"] {
         assert!(svg.contains(words), "{words}");
     }
+}
+
+/// Of snapshots that are left out the chart says what they were worth.
+#[test]
+fn the_error_of_fewer_snapshots_falls_with_their_number() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("chart");
+    let scene = folder.path().join("turbulence.toml");
+    std::fs::copy(config("turbulence_easy.toml"), &scene).unwrap();
+    let keys = ["source.nodes=[32, 16, 16]", "source.snapshots=13"].iter().flat_map(|key| ["--set", *key]);
+    let given = ["chart", text(&scene), "--device", "cpu", "--only", "scaling", "--seconds", "30", "--out", text(&out)];
+    run(&mut ridgewatch(given.into_iter().chain(keys))).success();
+    let chart = json(&out.join("chart.json"));
+    let points = chart["scaling"]["points"].as_array().unwrap();
+    let found: Vec<(f64, f64)> =
+        points.iter().filter(|point| point["axis"] == "snapshots").map(|point| (number(&point["value"]), number(&point["rms"]))).collect();
+    assert_eq!(found.iter().map(|(count, _)| *count).collect::<Vec<_>>(), [4.0, 7.0], "{:?}", chart["not_measured"]);
+    assert!(found[1].1 > 0.0 && found[1].1 < 0.7 * found[0].1, "{found:?}");
+    assert!(chart["verdict"].to_string().contains("rms from that of all snapshots"), "{}", chart["verdict"]);
 }
 
 #[test]
