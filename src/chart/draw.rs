@@ -1,7 +1,7 @@
 //! The panels of a chart as one picture, drawn by plotters.
 
 use super::ftle::{FtlePanel, FtlePoint};
-use super::picture::PicturePanel;
+use super::picture::{PictureCurve, PicturePanel};
 use super::scaling::ScalingPanel;
 use super::verdict::{CHARGED, size};
 use super::{Chart, front, pick};
@@ -153,19 +153,18 @@ fn picture_panel(panel: &PicturePanel) -> Panel {
         is_y_log: false,
         series: series.collect(),
         front: Vec::new(),
-        pick: None,
+        pick: panel.winner().map(|frame| (frame.seconds, frame.psnr)),
         levels: [35.0, 40.0].map(|level| (level, format!("{level} dB"))).to_vec(),
     }
 }
 
 /// Pictures of a window that slides at every frame; `None` if none was measured.
 fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
-    let series = panel.curves.iter().filter_map(|curve| {
-        let sliding = curve.sliding?;
-        Some(Series { name: curve.name(), points: vec![(1.0 / sliding.frames_per_second, sliding.psnr?)], is_line: false })
-    });
+    let at = |curve: &PictureCurve| curve.sliding.and_then(|sliding| Some((1.0 / sliding.frames_per_second, sliding.psnr?)));
+    // All curves, so that a method has the colour that it has beside.
+    let series = panel.curves.iter().map(|curve| Series { name: curve.name(), points: at(curve).into_iter().collect(), is_line: false });
     let series: Vec<Series> = series.collect();
-    (!series.is_empty()).then(|| Panel {
+    series.iter().any(|series| !series.points.is_empty()).then(|| Panel {
         title: "Pictures: error against time of a frame, window that slides at every frame".into(),
         x: "seconds per frame, preparation and training included".into(),
         y: "PSNR over lit pixels, dB".into(),

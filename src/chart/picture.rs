@@ -85,10 +85,29 @@ impl PictureCurve {
         }
     }
 
-    /// Seconds from which on the PSNR over lit pixels is at least `decibels`; `None` if the last frame is below.
-    pub fn seconds_to(&self, decibels: f64) -> Option<f64> {
+    /// The frame from which on the PSNR over lit pixels is at least `decibels`; `None` if the last one is below.
+    fn reaches(&self, decibels: f64) -> Option<&PicturePoint> {
         let below = self.frames.iter().rposition(|frame| frame.psnr < decibels);
-        self.frames.get(below.map_or(0, |last| last + 1)).map(|frame| frame.seconds)
+        self.frames.get(below.map_or(0, |last| last + 1))
+    }
+
+    /// Its seconds.
+    pub fn seconds_to(&self, decibels: f64) -> Option<f64> {
+        self.reaches(decibels).map(|frame| frame.seconds)
+    }
+}
+
+impl PicturePanel {
+    /// The curve of a method with the scene's surrogate.
+    pub(super) fn curve(&self, method: Method) -> Option<&PictureCurve> {
+        let name = PictureCurve::new(method, self.kind).name();
+        self.curves.iter().find(|curve| curve.name() == name)
+    }
+
+    /// The frame with which the method that wins the race reaches its target.
+    pub(super) fn winner(&self) -> Option<&PicturePoint> {
+        let race = self.race.as_ref()?;
+        self.curve(race.method)?.reaches(race.target)
     }
 }
 
@@ -290,12 +309,9 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         }
         curves.push(curve);
     }
-    let kind = settings.surrogate.kind;
-    let race = Race::of_times(|method, target| {
-        let name = PictureCurve::new(method, kind).name();
-        curves.iter().find(|curve| curve.name() == name).and_then(|curve| curve.seconds_to(target))
-    });
-    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind, race })
+    let mut panel = PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind: settings.surrogate.kind, race: None };
+    panel.race = Race::of_times(|method, target| panel.curve(method)?.seconds_to(target));
+    Ok(panel)
 }
 
 /// Frames of a still window for some seconds; returns the bytes of the surrogate.

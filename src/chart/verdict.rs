@@ -22,7 +22,12 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             Some(samples) => format!("the table pays from {samples:.1e} samples on"),
             None => "the table never pays".into(),
         };
-        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots."));
+        let tolerance = chart.ftle.as_ref().map(|panel| panel.tolerance);
+        let differs = point.rms.map_or(String::new(), |rms| {
+            let compared =
+                tolerance.map_or("", |tolerance| if rms <= tolerance { ", within the tolerance" } else { ", beyond the tolerance" });
+            format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots{compared}.")
+        });
         said.push(format!(
             "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
             point.axis,
@@ -165,7 +170,7 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
 fn of_auto(panel: &PicturePanel) -> String {
     let name = |method| PictureCurve::new(method, panel.kind).name();
     let first = name(Method::TwoLevel);
-    let curve = panel.curves.iter().find(|curve| curve.name() == first);
+    let curve = panel.curve(Method::TwoLevel);
     let compared = TARGETS.iter().filter_map(|&target| {
         let best = panel.curves.iter().filter_map(|curve| curve.seconds_to(target)).min_by(f64::total_cmp)?;
         Some(match curve.and_then(|curve| curve.seconds_to(target)) {

@@ -800,10 +800,14 @@ impl<B: Backend> Cycle<'_, B> {
                 self.run.progress.warnings.push(format!("slide {}: the stated error is not yet below {target}, but {why}", slide.index));
             }
             let seconds = if number > most { start.elapsed() } else { begun.elapsed() }.as_secs_f64();
+            // While a simulation's next step is awaited, it costs no time.
+            self.race(slides, slide, &pace, sink)?;
             transaction!(self, slide, run, on => run.train_meanwhile(on, slides, seconds));
             if !self.is_another_due(slides, slide.live.is_some())? {
                 self.frames_before = number.min(most).saturating_sub(warmups);
-                return self.race(slides, slide, &pace, sink);
+                let drawn = self.run.render.method;
+                self.run.races.iter_mut().for_each(|races| races.look_at(drawn, &pace));
+                return Ok(());
             }
         }
     }

@@ -1,6 +1,6 @@
 //! Races of methods, for `render.method = "auto"`.
 //!
-//! A run begins with `two_level`, so that no picture waits for a race, or with the method that won an earlier run's. At the end of a slide the others draw
+//! A run begins with `two_level`, so that no picture waits for a race, or with the method that won an earlier run. After the frames of a slide each draws
 //! pictures that are not shown. A race is run as soon as it takes at most a tenth of the time since the one before, and again when the character of the
 //! window has changed.
 
@@ -145,7 +145,7 @@ impl Races {
     }
 
     /// Looks at a slide by the method that draws.
-    fn look_at(&mut self, method: Method, pace: &Pace) {
+    pub(super) fn look_at(&mut self, method: Method, pace: &Pace) {
         let figure = pace.figure(method) + NOISE;
         let then = *self.then.get_or_insert(figure);
         self.differ = if figure > CHANGED * then || then > CHANGED * figure { self.differ + 1 } else { 0 };
@@ -167,7 +167,7 @@ impl Run<'_> {
         scene.render.method.has_surrogate() && (self.render.method.has_surrogate() || !may_go)
     }
 
-    /// Draws pictures by a method that are not shown, into the session's picture, which is empty.
+    /// Draws pictures by a method that are not shown.
     fn try_method<B: Backend>(&mut self, on: &mut On<B>, method: Method) -> Result<Pace, RunEnd> {
         let gate = self.gate(method);
         let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
@@ -175,8 +175,8 @@ impl Run<'_> {
         let smooth = self.smooth(&on.backend, serves, method, SAMPLES)?;
         let routing = Routing { gate: &gate, trace_budget: self.plan.scene.trust.trace_budget, keep: 0, extras: self.label_extras() };
         let first = RACE_PICTURE + (self.races.as_ref().map_or(0, |races| races.count) << 8);
-        let On { backend, tracer, picture, .. } = on;
-        let mut renderer = self.renderer.clone();
+        let On { backend, tracer, .. } = on;
+        let (mut renderer, mut picture) = (self.renderer.clone(), B::Picture::default());
         let (mut pace, mut before) = (Pace::default(), None);
         for number in 0..PICTURES as u64 {
             let job = FrameJob {
@@ -191,7 +191,7 @@ impl Run<'_> {
                 stop: self.stop,
             };
             let begin = Instant::now();
-            let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer, picture))?;
+            let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer, &mut picture))?;
             let seconds = begin.elapsed().as_secs_f64();
             check_stop(self.stop)?;
             let Rendered { film, error, .. } = rendered;
@@ -203,26 +203,23 @@ impl Run<'_> {
                 break;
             }
         }
-        *picture = Default::default();
         Ok(pace)
     }
 }
 
 impl<B: Backend> Cycle<'_, B> {
-    /// Lets the methods race at the end of a slide, if a race is due and another slide comes.
+    /// Lets the methods race after the frames of a slide, if a race is due and another slide comes.
     pub(super) fn race(&mut self, slides: &dyn Slides, slide: &Slide, pace: &Pace, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let run = &mut self.run;
         let drawn = run.render.method;
-        let Some(races) = run.races.as_mut().filter(|_| pace.frames > 0) else { return Ok(()) };
-        races.look_at(drawn, pace);
+        let Some(races) = &run.races else { return Ok(()) };
         let has_surrogate = with!(&self.session, on => on.surrogate.is_some());
         let tracing = if has_surrogate { 0.0 } else { run.progress.surrogate_seconds };
         let pictures = (METHODS.len() * PICTURES) as f64 * pace.last;
-        if slides.is_over() || slides.is_awaited() == Some(false) || !races.allow(tracing + pictures) {
+        if slides.is_over() || !races.allow(tracing + pictures) {
             return Ok(());
         }
         let begin = Instant::now();
-        with!(&mut self.session, on => on.picture = Default::default());
         let mut seconds = Vec::new();
         for method in METHODS {
             seconds.push((method, self.time_of(slide, method, pace)?));
@@ -237,6 +234,7 @@ impl<B: Backend> Cycle<'_, B> {
                 slide.index + 1,
                 race.why()
             )));
+            with!(&mut self.session, on => on.picture = Default::default());
             run.render = drawn_by(&run.plan.scene.render, race.method, run.plan.scene.render.budget);
             run.progress.seconds_per_sample = None;
             run.draw_color_bar();
