@@ -18,7 +18,7 @@ use thiserror::Error;
 const WIDTH: u32 = 1800;
 const ROW: u32 = 620;
 /// Width of the legend beside each panel.
-const LEGEND: u32 = 230;
+const LEGEND: u32 = 270;
 /// Font that is built in, so that a chart looks the same on every machine.
 const FONT: &str = "sans-serif";
 
@@ -242,6 +242,8 @@ fn log(range: Range<f64>) -> Range<f64> {
 
 /// Width and height that a label takes, in pixels.
 const LABEL: [i32; 2] = [160, 16];
+/// Pixels from a point to the corner of its label.
+const OFFSET: [i32; 2] = [8, -16];
 
 fn draw_panel<B, X, Y>(area: &DrawingArea<B, Shift>, panel: &Panel, x: X, y: Y) -> Result<(), DrawError>
 where
@@ -287,7 +289,12 @@ where
         }
     }
     plot.draw_series(LineSeries::new(panel.front.iter().map(|(x, y, _)| (*x, *y)), BLACK.stroke_width(1))).map_err(plot_error)?;
-    let mut drawn: Vec<(i32, i32)> = panel.levels.iter().map(|(level, _)| plot.backend_coord(&(x0 * 1.05, *level))).collect();
+    // Places whose labels would lie on those of the levels.
+    let beside = |(level, _): &(f64, String)| {
+        let (across, down) = plot.backend_coord(&(x0 * 1.05, *level));
+        (across - OFFSET[0], down - OFFSET[1])
+    };
+    let mut drawn: Vec<(i32, i32)> = panel.levels.iter().map(beside).collect();
     for (x, y, label) in &panel.front {
         // A label that would lie on another one is left out; the table has them all.
         let (across, down) = plot.backend_coord(&(*x, *y));
@@ -295,7 +302,7 @@ where
             continue;
         }
         drawn.push((across, down));
-        let at = EmptyElement::at((*x, *y)) + Text::new(label.clone(), (8, -16), (FONT, 13).into_font());
+        let at = EmptyElement::at((*x, *y)) + Text::new(label.clone(), (OFFSET[0], OFFSET[1]), (FONT, 13).into_font());
         plot.draw_series([at]).map_err(plot_error)?;
     }
     if let Some(pick) = panel.pick {

@@ -65,12 +65,14 @@ pub struct Options {
     /// Percentile of the FTLE that --ridge-length of a ridge line reaches.
     #[arg(long, value_name = "P", default_value_t = Strength::LINES.percentile, value_parser = percentile)]
     ridge_percentile: f64,
-    /// Least length of a ridge line that reaches the percentile, in nodes of the ridge grid.
-    #[arg(long, value_name = "NODES", default_value_t = Strength::LINES.extent, value_parser = not_negative)]
-    ridge_length: f64,
-    /// Standard deviation of the smoothing before derivatives, in nodes of the ridge grid; 0 for none.
-    #[arg(long, value_name = "NODES", default_value_t = Strength::LINES.smoothing, value_parser = smoothing)]
-    ridge_smoothing: f64,
+    /// Least length of a ridge line that reaches the percentile, in nodes of the ridge grid. Default: 30; a cell of the data at least, where its cells
+    /// resolve the FTLE.
+    #[arg(long, value_name = "NODES", value_parser = not_negative)]
+    ridge_length: Option<f64>,
+    /// Standard deviation of the smoothing before derivatives, in nodes of the ridge grid; 0 for none. Default: 2; 0.4 cells of the data at least, where
+    /// its cells resolve the FTLE.
+    #[arg(long, value_name = "NODES", value_parser = smoothing)]
+    ridge_smoothing: Option<f64>,
     /// Grid on which ridges are found, NXxNY. Default: two nodes per pixel along x and y.
     #[arg(long, value_name = "NXxNY", value_parser = grid)]
     ridge_grid: Option<[usize; 2]>,
@@ -165,12 +167,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
         None => None,
     };
-    let strength = Strength {
-        percentile: options.ridge_percentile,
-        extent: options.ridge_length,
-        smoothing: options.ridge_smoothing,
-        ..Strength::LINES
-    };
+    let strength = Strength { percentile: options.ridge_percentile, ..Strength::LINES.with(options.ridge_smoothing, options.ridge_length) };
     let wanted = MapOptions {
         pixels: options.width as usize,
         sampling: Sampling { seeds: options.seeds, seed: scene.seed },

@@ -43,10 +43,11 @@ pub struct Options {
     /// Least area of a surface that reaches the percentile, in squares of nodes. Default: 100.
     #[arg(long, value_name = "SQUARES", value_parser = not_negative)]
     area: Option<f64>,
-    /// Least length of a line that reaches the percentile, in nodes. Default: 30.
+    /// Least length of a line that reaches the percentile, in nodes. Default: 30; a cell of the data at least, where its cells resolve the FTLE.
     #[arg(long, value_name = "NODES", value_parser = not_negative)]
     length: Option<f64>,
-    /// Standard deviation of the smoothing before derivatives, in nodes; 0 for none. Default: 1 for surfaces, 2 for lines.
+    /// Standard deviation of the smoothing before derivatives, in nodes; 0 for none. Default: 1 for surfaces; for lines 2, and
+    /// 0.4 cells of the data at least, where its cells resolve the FTLE.
     #[arg(long, value_name = "NODES", value_parser = smoothing)]
     smoothing: Option<f64>,
 }
@@ -102,12 +103,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         (true, None, length) => (Strength::LINES, length),
         (false, area, None) => (Strength::SURFACES, area),
     };
-    let strength = Strength {
-        percentile: options.percentile,
-        sharpness: options.sharpness,
-        extent: extent.unwrap_or(defaults.extent),
-        smoothing: options.smoothing.unwrap_or(defaults.smoothing),
-    };
+    let strength = Strength { percentile: options.percentile, sharpness: options.sharpness, ..defaults.with(options.smoothing, extent) };
     let bar = messages::progress(Some(1));
     bar.set_message("nodes");
     let found = map::find(&moment, options.grid.as_ref().map(|grid| &grid.0[..]), &strength, &device, &mut |done, total| {

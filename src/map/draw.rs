@@ -178,6 +178,10 @@ impl<B: DrawingBackend> Pen<'_, B> {
         }
         // By the size of the panel, so that lines leave room between them.
         let thin = (1.3 * w.max(h) / 900.0).max(0.8);
+        // A light rim, since lines cross dark colours too.
+        for (_, line) in &panel.ridges {
+            self.line(line, corner, WHITE.mix(0.6), thin + 1.4 * u)?;
+        }
         for (colour, line) in &panel.ridges {
             let [r, g, b] = *colour;
             self.line(line, corner, RGBColor(r, g, b).to_rgba(), thin)?;

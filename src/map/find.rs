@@ -2,9 +2,9 @@
 
 use super::footprint::MapTracer;
 use super::lines::RidgeLine;
-use super::make::{MOST_NODES, about, ridge_field, ridge_nodes, structures};
+use super::make::{MOST_NODES, about, nodes_in_cell, ridge_field, ridge_nodes, structures};
 use super::ridges::Strength;
-use super::smoothing::roughness;
+use super::smoothing::{ROUGH, roughness};
 use super::surface_files::SurfacesAbout;
 use super::surfaces::Surfaces;
 use super::view::{View, is_geographic};
@@ -22,8 +22,6 @@ use std::time::Instant;
 const VOLUME_NODES: f64 = 1_048_576.0;
 /// Nodes traced at once, which bounds the memory beside the field.
 const AT_ONCE: usize = 1 << 19;
-/// Roughness from which on a grid is called too coarse.
-const ROUGH: f64 = 0.4;
 /// Pixels of the map on whose default grid lines are found.
 const MAP_PIXELS: usize = 800;
 
@@ -134,6 +132,7 @@ pub fn find(
     let start = Instant::now();
     let kind = structures(map.direction);
     let missing = || MapError::AllMissing(super::make::when(moment));
+    let mut strength = *strength;
     let (ridges, seconds, roughness) = match size[..] {
         [nx, ny, nz] => {
             let volume = volume(domain, geographic, &mut tracer, [nx, ny, nz], &mut count)?;
@@ -141,7 +140,7 @@ pub fn find(
             if volume.values.iter().all(|v| !v.is_finite()) {
                 return Err(missing());
             }
-            (RidgesOfMoment::Surfaces(volume.surfaces(strength)), traced, roughness(&volume.values, &size))
+            (RidgesOfMoment::Surfaces(volume.surfaces(&strength)), traced, roughness(&volume.values, &size))
         }
         _ => {
             let view = view.map_err(MapError::Usage)?;
@@ -150,7 +149,8 @@ pub fn find(
             if field.values.iter().all(|v| !v.is_finite()) {
                 return Err(missing());
             }
-            let lines = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
+            strength = strength.over(&field, nodes_in_cell(&moment.velocity, field.size));
+            let lines = field.ridges(&strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
             (RidgesOfMoment::Lines(lines), traced, roughness(&field.values, &size))
         }
     };

@@ -72,7 +72,8 @@ struct Traced {
     steps: usize,
     difference: Option<f64>,
     ridges: Vec<RidgeLine>,
-    roughness: Option<f64>,
+    /// Roughness of their field, and what counted as one.
+    found_by: Option<(f64, Strength)>,
 }
 
 /// Makes the map of a moment. Calls `progress` with the seeds traced and those in all; once it returns false, the map is abandoned.
@@ -115,7 +116,7 @@ pub fn make(
                 Raster::trace(&view, &mut tracer, options.sampling, &mut |pixels| count((pixels * options.sampling.seeds) as u64))
                     .map_err(RunError::of)?;
             let Some(raster) = traced_raster else { return Err(MapError::Stopped) };
-            let (mut ridges, mut roughness) = (Vec::new(), None);
+            let (mut ridges, mut found_by) = (Vec::new(), None);
             if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
                 let field = ridge_field(&view, &mut tracer, size, &mut |seeds| {
                     count(seeds as u64);
@@ -124,14 +125,15 @@ pub fn make(
                 let found = smoothing::roughness(&field.values, &size);
                 let panel = if panels > 1 { format!("{} FTLE, tau = {tau}: ", direction.name()) } else { String::new() };
                 notes.extend(too_coarse(found, "--ridge-grid").map(|text| panel + &text));
-                roughness = Some(found);
-                ridges = field.ridges(strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
+                let strength = strength.over(&field, nodes_in_cell(&moment.velocity, size));
+                found_by = Some((found, strength));
+                ridges = field.ridges(&strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();
             }
             let flow = tracer.flow();
             let difference = flow.step_choice().map(|chosen| chosen.difference).filter(|d| d.is_finite());
             let steps = flow.steps();
             notes.extend(tracer.note.take());
-            traced.push(Traced { direction, tau, raster, steps, difference, ridges, roughness });
+            traced.push(Traced { direction, tau, raster, steps, difference, ridges, found_by });
         }
     }
     if traced.iter().all(|t| t.raster.mean.iter().all(|v| v.is_nan())) {
@@ -157,12 +159,7 @@ pub fn make(
         ftle_unit: rate.unit.clone(),
         range: shown,
         fastest: found.map(|arrows| arrows.fastest),
-        ridges: options.ridges.zip(nodes).map(|(Strength { percentile, extent, smoothing, .. }, grid)| RidgeRecord {
-            grid,
-            percentile,
-            length: extent,
-            smoothing,
-        }),
+        ridges: options.ridges.zip(nodes).map(|(Strength { percentile, .. }, grid)| RidgeRecord { grid, percentile }),
         panels: traced.iter().map(|t| panel_record(t, options, &rate, shown)).collect(),
     };
     let about = about(moment, rate, level);
@@ -234,6 +231,14 @@ pub(super) fn ridge_field(
     Ok(Field { origin: [west, south], step, size, values, scale })
 }
 
+/// Nodes of a grid from edge to edge of the domain in a cell of the data, along x and y; `None` for closed forms.
+pub(super) fn nodes_in_cell(velocity: &VelocitySource, size: [usize; 2]) -> Option<[f64; 2]> {
+    let VelocitySource::Window(window) = velocity else { return None };
+    let axes = &window.grid()?.axes;
+    let nodes = |k: usize| Some((size[k] - 1) as f64 / axes.get(k)?.cells() as f64);
+    Some([nodes(0)?, nodes(1)?])
+}
+
 /// Names and units of the coordinates.
 fn axes(velocity: &VelocitySource) -> [(String, String); 3] {
     [0, 1, 2].map(|k| match velocity {
@@ -284,7 +289,9 @@ fn panel_record(traced: &Traced, options: &MapOptions, rate: &Rate, shown: [f64;
         missing_share: (0..raster.missing.len()).filter(|p| raster.is_land(*p)).count() as f64 / within.max(1) as f64,
         failed_seeds: raster.failed,
         ridge_lines: options.ridges.map(|_| traced.ridges.len()),
-        ridge_roughness: traced.roughness,
+        ridge_roughness: traced.found_by.map(|(roughness, _)| roughness),
+        ridge_smoothing: traced.found_by.map(|(_, strength)| strength.smoothing),
+        ridge_length: traced.found_by.map(|(_, strength)| strength.extent),
         colours: ramp(options.both, traced.direction).name(),
     }
 }

@@ -47,12 +47,8 @@ pub struct MapRecord {
 pub struct RidgeRecord {
     /// Nodes along x and y.
     pub grid: [usize; 2],
-    /// Percentile of the FTLE that `length` of a line reaches.
+    /// Percentile of the FTLE that part of a line reaches.
     pub percentile: f64,
-    /// Least length of a line on which it reaches the percentile, in nodes.
-    pub length: f64,
-    /// Standard deviation of the smoothing, in nodes.
-    pub smoothing: f64,
 }
 
 /// Record of the FTLE of one tau and direction.
@@ -80,6 +76,10 @@ pub struct PanelRecord {
     pub ridge_lines: Option<usize>,
     /// Roughness of the field that ridges are found in, as in [`super::RidgesRecord`]; `None` without ridges.
     pub ridge_roughness: Option<f64>,
+    /// Standard deviation of the smoothing before ridges are found, in nodes; `None` without ridges.
+    pub ridge_smoothing: Option<f64>,
+    /// Least length of a line on which the FTLE reaches the percentile, in nodes; `None` without ridges.
+    pub ridge_length: Option<f64>,
     /// Colour map.
     pub colours: &'static str,
 }

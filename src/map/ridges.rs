@@ -7,7 +7,7 @@
 //! with a share of the neighbours'. The eigenvalues are tested at the crossing.
 
 use super::contour::{Edge, Segments};
-use super::smoothing::smoothed;
+use super::smoothing::{is_resolved, smoothed};
 use rayon::prelude::*;
 
 /// A field on a regular grid, x fastest. Values that are not finite are missing.
@@ -36,13 +36,31 @@ pub struct Strength {
     pub extent: f64,
     /// Standard deviation of the Gaussian that smooths the field before it is differentiated, in nodes; 0 for none.
     pub smoothing: f64,
+    /// Least smoothing, and least length of a line, in cells of the data where these resolve the field: what is finer there is that of the interpolation. 0
+    /// for none. Lines only.
+    pub cells: [f64; 2],
 }
 
 impl Strength {
     /// Default of ridge lines.
-    pub const LINES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 30.0, smoothing: 2.0 };
+    pub const LINES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 30.0, smoothing: 2.0, cells: [0.4, 1.0] };
     /// Default of ridge surfaces, whose grids are coarser.
-    pub const SURFACES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 100.0, smoothing: 1.0 };
+    pub const SURFACES: Self = Self { percentile: 80.0, sharpness: 0.0, extent: 100.0, smoothing: 1.0, cells: [0.0; 2] };
+
+    /// With another smoothing, or another least length or area, which then hold whatever the data resolve.
+    pub fn with(self, smoothing: Option<f64>, extent: Option<f64>) -> Self {
+        let kept = |given: Option<f64>, cells: f64| if given.is_some() { 0.0 } else { cells };
+        let cells = [kept(smoothing, self.cells[0]), kept(extent, self.cells[1])];
+        Self { smoothing: smoothing.unwrap_or(self.smoothing), extent: extent.unwrap_or(self.extent), cells, ..self }
+    }
+
+    /// What counts as a ridge of a field with so many nodes in a cell of the data along x and y.
+    pub(super) fn over(self, field: &Field, nodes_in_cell: Option<[f64; 2]>) -> Self {
+        let Some(nodes) = nodes_in_cell.filter(|nodes| is_resolved(&field.values, field.size, *nodes)) else { return self };
+        let cell = (nodes[0] * nodes[1]).sqrt();
+        let [smoothing, extent] = self.cells.map(|cells| cells * cell);
+        Self { smoothing: self.smoothing.max(smoothing), extent: self.extent.max(extent), ..self }
+    }
 
     /// Whether a ridge is kept of which this length or area reaches the percentile. Some of it must, however little is asked for.
     pub(super) fn suffices(&self, strong: f64) -> bool {

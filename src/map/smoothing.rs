@@ -49,6 +49,20 @@ pub(super) fn roughness(values: &[f32], size: &[usize]) -> f64 {
     if variance > 0.0 && differences[0] > 0.0 { (differences[1] / differences[0] / variance).sqrt() } else { 0.0 }
 }
 
+/// Roughness from which on a grid is too coarse.
+pub(super) const ROUGH: f64 = 0.4;
+
+/// Whether cells of so many nodes resolve a field in two dimensions: every such node alone would.
+pub(super) fn is_resolved(values: &[f32], size: [usize; 2], nodes: [f64; 2]) -> bool {
+    let counts = [0, 1].map(|k| ((size[k] - 1) as f64 / nodes[k]) as usize + 1);
+    if nodes.iter().any(|nodes| *nodes < 2.0) || counts.iter().any(|count| *count < 3) {
+        return false;
+    }
+    let at = |k: usize, n: usize| ((n as f64 * nodes[k]).round() as usize).min(size[k] - 1);
+    let of_cells: Vec<f32> = (0..counts[0] * counts[1]).map(|n| values[at(1, n / counts[0]) * size[0] + at(0, n % counts[0])]).collect();
+    roughness(&of_cells, &counts) < ROUGH
+}
+
 /// Count, sum and sum of squares of the finite values.
 fn moments(values: impl ParallelIterator<Item = f64>) -> [f64; 3] {
     values.filter(|v| v.is_finite()).map(|v| [1.0, v, v * v]).reduce(|| [0.0; 3], |a, b| std::array::from_fn(|k| a[k] + b[k]))
@@ -56,7 +70,18 @@ fn moments(values: impl ParallelIterator<Item = f64>) -> [f64; 3] {
 
 #[cfg(test)]
 mod tests {
-    use super::roughness;
+    use super::{is_resolved, roughness};
+
+    #[test]
+    fn cells_resolve_what_is_wider_than_they() {
+        let size = [201, 101];
+        let wave = |length: f64| {
+            (0..size[0] * size[1]).map(|n| (std::f64::consts::TAU * (n % size[0]) as f64 / length).sin() as f32).collect::<Vec<_>>()
+        };
+        // Cells of ten nodes: waves of 200 nodes and of 20.
+        assert!(is_resolved(&wave(200.0), size, [10.0, 10.0]) && !is_resolved(&wave(27.0), size, [10.0, 10.0]));
+        assert!(!is_resolved(&wave(200.0), size, [1.5, 10.0]), "a grid as coarse as the data says nothing");
+    }
 
     #[test]
     fn roughness_of_noise_and_of_waves_is_that_of_the_formula() {

@@ -110,6 +110,34 @@ fn a_ridge_grid_that_is_too_coarse_is_told() {
     }
 }
 
+/// Kinks at the faces of cells are no ridges, where the cells resolve the FTLE.
+#[test]
+fn ridges_are_not_finer_than_data_that_resolve_them() {
+    let folder = tempfile::tempdir().unwrap();
+    // Waves of 20 degrees, 40 cells.
+    let axis = |first: f64, count: usize| (0..count).map(|i| first + 0.5 * i as f64).collect::<Vec<_>>();
+    let (lon, lat, wave) = (axis(15.0, 41), axis(-40.0, 21), |degrees: f64| (degrees * std::f64::consts::TAU / 20.0).sin());
+    let data = Fixture::on(
+        NETCDF4,
+        &[("time", "days since 2002-01-01", &[0.0, 1.0, 2.0]), ("lat", "degrees_north", &lat), ("lon", "degrees_east", &lon)],
+    )
+    .winds(f32s(fill(3, 21, 41, |_, j, _| 0.8 * wave(lat[j]))), f32s(fill(3, 21, 41, |_, _, i| 0.5 * wave(lon[i]))))
+    .write(&folder.path().join("waves.nc"));
+    let out = folder.path().join("waves.png");
+    let base = [text(&data), "--tau", "1 days", "--width", "200", "--seeds", "2", "--ridges"];
+    let panel = |more: &[&str]| map(&out, &[&base[..], more].concat())["panels"][0].clone();
+    let number = |panel: &Value, key: &str| panel[key].as_f64().unwrap();
+    // 401 x 201 nodes, 40 x 20 cells: ten nodes a cell.
+    let found = panel(&["--ridge-grid", "401x201"]);
+    assert_eq!((number(&found, "ridge_smoothing"), number(&found, "ridge_length")), (4.0, 30.0), "{found}");
+    let found = panel(&["--ridge-grid", "2001x1001"]);
+    assert_eq!((number(&found, "ridge_smoothing"), number(&found, "ridge_length")), (20.0, 50.0), "{found}");
+    let given = panel(&["--ridge-grid", "2001x1001", "--ridge-smoothing", "3", "--ridge-length", "7"]);
+    assert_eq!((number(&given, "ridge_smoothing"), number(&given, "ridge_length")), (3.0, 7.0), "{given}");
+    let coarse = panel(&["--ridge-grid", "41x21"]);
+    assert_eq!((number(&coarse, "ridge_smoothing"), number(&coarse, "ridge_length")), (2.0, 30.0), "{coarse}");
+}
+
 #[test]
 fn both_directions_and_several_taus_share_a_picture() {
     let folder = tempfile::tempdir().unwrap();

@@ -13,7 +13,7 @@ fn field(origin: [f64; 2], step: f64, size: [usize; 2], of: impl Fn(f64, f64) ->
     Field { origin, step: [step; 2], size, values: (0..size[0] * size[1]).map(value).collect(), scale: vec![[1.0; 2]; size[1]] }
 }
 
-const ALL: Strength = Strength { percentile: 0.0, sharpness: 0.0, extent: 5.0, smoothing: 0.0 };
+const ALL: Strength = Strength { percentile: 0.0, sharpness: 0.0, extent: 5.0, smoothing: 0.0, cells: [0.0; 2] };
 
 /// FTLE of u = sin x, v = -y over tau: tan(X / 2) = e^tau tan(x / 2), so that dX/dx = e^tau / (cos^2 (x/2) + e^(2 tau) sin^2 (x/2)). Its ridge is x = 0.
 fn nonlinear_saddle(x: f64, tau: f64) -> f64 {

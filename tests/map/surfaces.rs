@@ -15,7 +15,7 @@ fn volume(origin: f64, step: f64, n: usize, of: impl Fn(Vector) -> f64) -> Volum
     Volume { origin: [origin; 3], step: [step; 3], size: [n; 3], values, scale: vec![[1.0; 3]; n], rounding: 0.0 }
 }
 
-const ALL: Strength = Strength { percentile: 0.0, sharpness: 0.0, extent: 20.0, smoothing: 0.0 };
+const ALL: Strength = Strength { percentile: 0.0, sharpness: 0.0, extent: 20.0, smoothing: 0.0, cells: [0.0; 2] };
 
 /// Vertices minus edges plus triangles, and the number of edges that belong to one triangle only. Asserts that no edge has more than two, and that
 /// both pass it in opposite directions.
