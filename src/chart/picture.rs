@@ -310,7 +310,14 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         curves.push(curve);
     }
     let mut panel = PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind: settings.surrogate.kind, race: None };
-    panel.race = Race::of_times(|method, target| panel.curve(method)?.seconds_to(target));
+    panel.race = Race::of_times(|method, target| {
+        let curve = panel.curve(method)?;
+        match method {
+            // The curve is of sums of frames, which a run does not draw.
+            Method::Reference => curve.frames.first().filter(|frame| frame.psnr >= target).map(|frame| frame.seconds),
+            _ => curve.seconds_to(target),
+        }
+    });
     Ok(panel)
 }
 

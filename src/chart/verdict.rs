@@ -22,12 +22,7 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             Some(samples) => format!("the table pays from {samples:.1e} samples on"),
             None => "the table never pays".into(),
         };
-        let tolerance = chart.ftle.as_ref().map(|panel| panel.tolerance);
-        let differs = point.rms.map_or(String::new(), |rms| {
-            let compared =
-                tolerance.map_or("", |tolerance| if rms <= tolerance { ", within the tolerance" } else { ", beyond the tolerance" });
-            format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots{compared}.")
-        });
+        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots."));
         said.push(format!(
             "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
             point.axis,

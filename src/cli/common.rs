@@ -148,7 +148,7 @@ impl RaceFile {
     /// The race of an earlier run.
     pub fn read(&self) -> Option<Race> {
         let remembered: Remembered = serde_json::from_slice(&std::fs::read(&self.path).ok()?).ok()?;
-        Some(remembered.race).filter(|_| remembered.of == self.of)
+        Some(remembered.race).filter(|race| remembered.of == self.of && race.is_sound())
     }
 
     /// Keeps a race. A folder that cannot be written costs the next run its own race, and nothing else.
@@ -226,7 +226,7 @@ pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Res
 
 /// Why `--verify` checks nothing, if it is given with a method that states no error of a surrogate.
 pub fn verifies_nothing(setup: &Setup, points: u64) -> Option<Usage> {
-    let method = setup.plan.scene.render.method;
+    let method = setup.first_method();
     (points > 0 && !method.has_surrogate()).then(|| {
         let accepted = "accepted with methods two_level, marched, surrogate and gated";
         Usage(format!("--verify {points}: method {} has no surrogate whose error could be checked; {accepted}", method.name()))

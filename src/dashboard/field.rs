@@ -31,8 +31,8 @@ struct Job {
     done: AtomicUsize,
     all: AtomicUsize,
     asked: Mutex<Instant>,
-    /// The file, or why there is none.
-    made: Mutex<Option<Result<Vec<u8>, Refusal>>>,
+    /// The file, or why there is none. It is kept for all who ask for it, until nobody does.
+    made: Mutex<Option<Result<Bytes, Refusal>>>,
 }
 
 /// How far a field is.
@@ -50,11 +50,13 @@ impl Fields {
         lock(&self.job)
     }
 
-    /// The job of a slide, which begins if there is none; without a number a new one of the newest slide.
+    /// The job of a slide, which begins if there is none; without a number that of the newest slide.
     ///
     /// # Errors
     /// The slide is not kept, or the field of another one is being traced.
     fn of(self: &Arc<Self>, slide: Option<u64>, newest: &Arc<NewestFrame>) -> Result<Arc<Job>, Refusal> {
+        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
+        let slide = slide.or_else(|| slides.index());
         let mut kept = self.lock();
         match &*kept {
             Some(job) if Some(job.slide) == slide => return Ok(Arc::clone(job)),
@@ -66,7 +68,6 @@ impl Fields {
             }
             _ => {}
         }
-        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
         let field = slides.get(slide).map_err(no_field)?;
         let now = Instant::now();
         let [done, all] = [0, 0].map(AtomicUsize::new);
@@ -80,14 +81,11 @@ impl Fields {
         let tracing = Arc::clone(&job);
         let made = tokio::task::spawn_blocking(move || tracing.trace(&field, &run)).await;
         let failed = |error: String| (StatusCode::INTERNAL_SERVER_ERROR, error);
-        *lock(&job.made) = Some(made.unwrap_or_else(|error| Err(failed(error.to_string()))));
-        while lock(&job.asked).elapsed() < FORGOTTEN && lock(&job.made).is_some() {
+        *lock(&job.made) = Some(made.unwrap_or_else(|error| Err(failed(error.to_string()))).map(Bytes::from));
+        while lock(&job.asked).elapsed() < FORGOTTEN {
             tokio::time::sleep(Duration::from_secs(1)).await;
         }
-        let mut kept = self.lock();
-        if kept.as_ref().is_some_and(|kept| Arc::ptr_eq(kept, &job)) {
-            *kept = None;
-        }
+        self.lock().take_if(|kept| Arc::ptr_eq(kept, &job));
     }
 }
 
@@ -129,13 +127,15 @@ impl Pixels {
         *lock(&job.asked) = Instant::now();
         // Without a place for it the file waits.
         let place = Arc::clone(&self.downloads).try_acquire_owned().ok();
-        let made = place.and_then(|place| Some((lock(&job.made).take()?, place)));
+        let made = place.and_then(|place| Some((lock(&job.made).clone()?, place)));
         let Some((made, place)) = made else {
             let underway =
                 serde_json::to_string(&job.underway()).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))?;
             return Ok((StatusCode::ACCEPTED, [(CONTENT_TYPE, "application/json")], underway).into_response());
         };
-        self.fields.lock().take_if(|kept| Arc::ptr_eq(kept, &job));
+        if made.is_err() {
+            self.fields.lock().take_if(|kept| Arc::ptr_eq(kept, &job));
+        }
         let name = format!("{}-field-slide-{:04}.nc", newest.run(), job.slide);
         let bytes = made.map_err(|(status, why)| (status, format!("{name} cannot be made: {why}")))?;
         let head = [(CONTENT_TYPE, "application/netcdf".to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))];

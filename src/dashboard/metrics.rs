@@ -90,6 +90,7 @@ impl Totals {
         for (sum, more) in [
             (&mut sum.slide, seconds.slide),
             (&mut sum.waiting, seconds.waiting),
+            (&mut sum.race, seconds.race),
             (&mut sum.refine, seconds.refine),
             (&mut sum.render, seconds.render),
             (&mut sum.trace, seconds.trace),
@@ -129,6 +130,7 @@ impl Totals {
         let stages = [
             ("slide", seconds.slide),
             ("waiting", seconds.waiting),
+            ("race", seconds.race),
             ("refine", seconds.refine),
             ("render", seconds.render),
             ("trace", seconds.trace),

@@ -223,6 +223,7 @@ pub(super) fn no_field(error: NoField) -> Refusal {
     match error {
         NoField::Missing(why) => (StatusCode::NOT_FOUND, why),
         NoField::Gone(why) => (StatusCode::GONE, why),
+        NoField::NoRoom(why) => (StatusCode::SERVICE_UNAVAILABLE, why),
         NoField::System(error) => (StatusCode::INTERNAL_SERVER_ERROR, error),
     }
 }

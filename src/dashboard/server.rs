@@ -179,6 +179,7 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
         return Ok(match wanted {
             // It takes processors from the run.
             OfFrames::Field if rights != Rights::Steer => return Err(NO_FIELD),
+            OfFrames::Field if parts.method != Method::GET => (StatusCode::METHOD_NOT_ALLOWED, [(ALLOW, "GET")]).into_response(),
             OfFrames::Field => hub.pixels.field(&parts.uri),
             OfFrames::File(file) => hub.pixels.download(file, &parts.uri).await,
             OfFrames::Plane => hub.pixels.plane(&parts.uri).await,

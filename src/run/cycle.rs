@@ -524,6 +524,9 @@ impl<'a> Run<'a> {
             render = drawn_by(&render, race.method, render.budget);
             options.steering.iter().for_each(|steering| steering.keep_method(race.method));
         }
+        if !render.method.has_surrogate() {
+            Decision::withdraw(&mut report.decisions, &["surrogate.table_nodes"]);
+        }
         let progress = RunProgress::default();
         Ok(Self {
             plan,
@@ -719,6 +722,7 @@ impl<B: Backend> Cycle<'_, B> {
             let keeps_picture = commands == Commands::Colours && self.run.render.method == Method::Map;
             if commands >= Commands::Method && !keeps_picture {
                 with!(&mut self.session, on => on.picture = Default::default());
+                pace.begin_anew();
             }
             // Only pictures that accumulate have a target.
             let target = self.run.render.until;
@@ -770,7 +774,7 @@ impl<B: Backend> Cycle<'_, B> {
             slide.waited = 0.0;
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
-            pace.add(&frame.record);
+            pace.add(self.run.render.method, &frame.record);
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
@@ -806,7 +810,7 @@ impl<B: Backend> Cycle<'_, B> {
             if !self.is_another_due(slides, slide.live.is_some())? {
                 self.frames_before = number.min(most).saturating_sub(warmups);
                 let drawn = self.run.render.method;
-                self.run.races.iter_mut().for_each(|races| races.look_at(drawn, &pace));
+                self.run.races.iter_mut().for_each(|races| races.look_at(slide.index, drawn, &pace));
                 return Ok(());
             }
         }
@@ -941,8 +945,10 @@ impl Run<'_> {
         self.asked = asked(&self.plan.map, &self.asked, set);
         let is_other = set.range.is_some() || set.tolerance.is_some() || set.tau.is_some() || set.direction.is_some();
         self.races.iter_mut().filter(|_| is_other).for_each(Races::begin_anew);
-        if let Some(method) = set.method {
+        if set.method.is_some() || set.budget.is_some() {
             self.races = None;
+        }
+        if let Some(method) = set.method {
             Decision::withdraw(&mut self.report.decisions, &["render.method"]);
             // Of another method.
             self.progress.seconds_per_sample = None;
@@ -951,7 +957,8 @@ impl Run<'_> {
         }
         if let Some(budget) = set.budget {
             self.budget = Some(budget);
-            self.render.budget = self.budget;
+            // Since it was accepted, a race may have gone on with a method that has none.
+            self.render = drawn_by(&self.plan.scene.render, self.render.method, self.budget);
         }
         if let Some(tolerance) = set.tolerance {
             self.learning.trust.set_tolerance(tolerance);

@@ -113,7 +113,8 @@ impl Run<'_> {
         }
         let (tally, stats) = (&work.rendered.tally, &work.rendered.stats);
         record.seconds = StageSeconds {
-            slide: place.preparing + std::mem::take(&mut self.progress.raced),
+            slide: place.preparing,
+            race: std::mem::take(&mut self.progress.raced),
             waiting: slide.waited,
             refine: place.refining,
             render: work.render_seconds - tally.trace_seconds - tally.predict_seconds,

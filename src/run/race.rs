@@ -12,6 +12,7 @@ use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present, with};
 use super::{Event, FrameRecord};
 use crate::backend::{Backend, FrameJob, Rendered, Routing, Surrogate};
+use crate::render::smooth::PictureError;
 use crate::render::{Method, noise_psnr};
 use crate::surrogate::Kind;
 use serde::{Deserialize, Serialize};
@@ -34,6 +35,8 @@ const METHODS: [Method; 3] = [Method::TwoLevel, Method::Marched, Method::Referen
 const SAMPLES: f64 = 2.0;
 /// Pictures of a method in a race. Two tell the noise of a method that states no error.
 const PICTURES: usize = 2;
+/// Decibels by which a picture is noisier than the mean of two.
+const OF_TWO: f64 = 3.0103;
 /// Number of the first picture of a race.
 const RACE_PICTURE: u64 = 1 << 42;
 
@@ -43,7 +46,8 @@ pub struct Race {
     /// The method that reaches the target first; one that stands before it in the order `two_level`, `marched`, `reference` if that takes at most 10 %
     /// longer.
     pub method: Method,
-    /// Seconds since a slide to the target, by method; extrapolated if fewer pictures were drawn. `None` for methods that never reach it.
+    /// Seconds since a slide to the target, by method; extrapolated if fewer pictures were drawn. `None` for methods that never reach it: frames of
+    /// `marched` and of `reference` do not become better, so that one of them must.
     pub seconds: Vec<(Method, Option<f64>)>,
     /// The target, in decibels over lit pixels.
     pub target: f64,
@@ -54,13 +58,14 @@ pub struct Race {
 /// What a method takes for a slide.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Pace {
+    method: Option<Method>,
     /// Seconds of preparing the slide.
     prepared: f64,
     frames: usize,
     /// Seconds of all frames, and of the last one.
     drawn: f64,
     last: f64,
-    /// PSNR of the last frame, in decibels; `None` if the method states none.
+    /// PSNR of the last frame, in decibels; `None` if none is known.
     psnr: Option<f64>,
 }
 
@@ -73,9 +78,15 @@ pub(super) struct Races {
     /// Figure of the drawn method in the slide after the last race, and slides in a row that differ from it.
     then: Option<f64>,
     differ: usize,
-    /// Races so far.
+    /// Races so far, and the slide of the last one.
     count: u64,
+    slide: Option<u64>,
+    /// Seconds that the last one took, or twice those after which it was given up.
+    cost: f64,
 }
+
+/// A race is given up: it takes too long, or the device was lost.
+struct Abandoned;
 
 impl Race {
     /// Of the seconds from a slide to a PSNR in decibels, by method; `None` if no method reaches the target.
@@ -92,6 +103,11 @@ impl Race {
         Self { method, seconds, target: TARGET, slide }
     }
 
+    /// Whether this program may have run it.
+    pub fn is_sound(&self) -> bool {
+        METHODS.contains(&self.method)
+    }
+
     /// The times that decided.
     pub fn why(&self) -> String {
         let time = |seconds: &Option<f64>| match seconds.filter(|seconds| seconds.is_finite()) {
@@ -105,24 +121,29 @@ impl Race {
 }
 
 impl Pace {
-    /// Adds a frame.
-    pub(super) fn add(&mut self, record: &FrameRecord) {
+    /// Adds a frame. What was drawn by another method does not count.
+    pub(super) fn add(&mut self, method: Method, record: &FrameRecord) {
+        if self.method.is_some_and(|before| before != method) {
+            self.begin_anew();
+        }
+        self.method = Some(method);
         self.prepared += record.seconds.slide;
-        // A march does not improve, so that it must be sure to be there.
-        let stated = |error: &crate::render::smooth::PictureError| {
-            if record.method == Method::Marched.name() { error.psnr.low } else { error.psnr.value }
-        };
-        self.draw(record.seconds.total, record.picture_error.as_ref().map(stated));
+        self.draw(record.seconds.total, record.picture_error.as_ref().map(|error| stated(method, error)));
+    }
+
+    /// The picture starts anew.
+    pub(super) fn begin_anew(&mut self) {
+        *self = Self { prepared: self.prepared, ..Self::default() };
     }
 
     fn draw(&mut self, seconds: f64, psnr: Option<f64>) {
         (self.frames, self.drawn, self.last, self.psnr) = (self.frames + 1, self.drawn + seconds, seconds, psnr);
     }
 
-    /// Seconds since the slide to a PSNR: those taken, or extrapolated as if the squared error fell in proportion to the number of frames. `None` for a
-    /// march below it, whose error samples do not lower, and without a PSNR.
+    /// Seconds since the slide to a PSNR: those taken, or extrapolated as if the squared error fell in proportion to the number of frames. `None` below it
+    /// for methods whose frames do not become better, and without a PSNR.
     fn seconds_to(&self, target: f64, method: Method) -> Option<f64> {
-        let psnr = self.psnr.filter(|psnr| method != Method::Marched || *psnr >= target)?;
+        let psnr = self.psnr.filter(|psnr| method == Method::TwoLevel || *psnr >= target)?;
         let more = self.frames as f64 * (10f64.powf((target - psnr) / 10.0) - 1.0).max(0.0);
         Some(self.prepared + self.drawn + more * self.last)
     }
@@ -136,7 +157,7 @@ impl Pace {
 impl Races {
     /// Races of a run that begins now, after an earlier run's race.
     pub(super) fn new(earlier: Option<&Race>) -> Self {
-        Self { is_due: earlier.is_none(), since: Instant::now(), then: None, differ: 0, count: 0 }
+        Self { is_due: earlier.is_none(), since: Instant::now(), then: None, differ: 0, count: 0, slide: None, cost: 0.0 }
     }
 
     /// The flow map or the colours are other ones.
@@ -144,18 +165,27 @@ impl Races {
         self.is_due = true;
     }
 
-    /// Looks at a slide by the method that draws.
-    pub(super) fn look_at(&mut self, method: Method, pace: &Pace) {
+    /// Looks at a slide, by the method that draws. One with a race has frames of two methods, or of one that draws no longer.
+    pub(super) fn look_at(&mut self, slide: u64, method: Method, pace: &Pace) {
+        if self.slide == Some(slide) || pace.method != Some(method) {
+            return;
+        }
         let figure = pace.figure(method) + NOISE;
         let then = *self.then.get_or_insert(figure);
         self.differ = if figure > CHANGED * then || then > CHANGED * figure { self.differ + 1 } else { 0 };
         self.is_due |= self.differ >= IN_A_ROW;
     }
 
-    /// Whether a race is due that takes so many seconds.
-    fn allow(&self, seconds: f64) -> bool {
-        self.is_due && seconds <= SHARE * self.since.elapsed().as_secs_f64()
+    /// Seconds for a race, if one is due and takes no longer than these.
+    fn allow(&self, seconds: f64) -> Option<f64> {
+        let room = SHARE * self.since.elapsed().as_secs_f64();
+        (self.is_due && seconds.max(self.cost) <= room).then_some(room)
     }
+}
+
+/// PSNR that a frame states. A march does not become better, so that it must be sure to be there.
+fn stated(method: Method, error: &PictureError) -> f64 {
+    if method == Method::Marched { error.psnr.low } else { error.psnr.value }
 }
 
 impl Run<'_> {
@@ -195,67 +225,77 @@ impl Run<'_> {
             let seconds = begin.elapsed().as_secs_f64();
             check_stop(self.stop)?;
             let Rendered { film, error, .. } = rendered;
-            let stated = error.map(|error| if method == Method::Marched { error.psnr.low } else { error.psnr.value });
+            // Of a frame with the samples of the run, as the noise falls.
+            let more = 10.0 * (self.render.samples / SAMPLES).log10() - OF_TWO;
             let tone_map = self.render.tone_map_of(method);
-            let told = before.replace(film.clone()).map(|before| noise_psnr(&before, &film, tone_map));
-            pace.draw(seconds, stated.or(told));
+            let told = before.replace(film.clone()).map(|before| noise_psnr(&before, &film, tone_map) + more);
+            pace.draw(seconds, error.map(|error| stated(method, &error)).or(told));
             if method == Method::Marched {
                 break;
             }
+        }
+        if method == Method::Reference {
+            let seconds = pace.last * (self.render.samples / SAMPLES).max(1.0);
+            (pace.frames, pace.drawn, pace.last) = (1, seconds, seconds);
         }
         Ok(pace)
     }
 }
 
 impl<B: Backend> Cycle<'_, B> {
-    /// Lets the methods race after the frames of a slide, if a race is due and another slide comes.
+    /// Lets the methods race after the frames of a slide, if a race is due and another slide comes. It is given up if it takes longer than its share.
     pub(super) fn race(&mut self, slides: &dyn Slides, slide: &Slide, pace: &Pace, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let run = &mut self.run;
-        let drawn = run.render.method;
         let Some(races) = &run.races else { return Ok(()) };
         let has_surrogate = with!(&self.session, on => on.surrogate.is_some());
         let tracing = if has_surrogate { 0.0 } else { run.progress.surrogate_seconds };
-        let pictures = (METHODS.len() * PICTURES) as f64 * pace.last;
-        if slides.is_over() || !races.allow(tracing + pictures) {
-            return Ok(());
-        }
-        let begin = Instant::now();
+        // Of `marched` one picture tells all.
+        let pictures = METHODS.len() * PICTURES - 1;
+        let wanted = tracing + pictures as f64 * pace.last;
+        let Some(room) = races.allow(wanted).filter(|_| !slides.is_over()) else { return Ok(()) };
+        let (begin, count) = (Instant::now(), races.count + 1);
         let mut seconds = Vec::new();
         for method in METHODS {
-            seconds.push((method, self.time_of(slide, method, pace)?));
+            // What a method takes is known afterwards only.
+            let is_late = begin.elapsed().as_secs_f64() > room;
+            match if is_late { Err(Abandoned) } else { self.time_of(slide, method, pace)? } {
+                Ok(time) => seconds.push((method, time)),
+                Err(Abandoned) => break,
+            }
         }
-        let race = Race::of(seconds, slide.index);
-        let run = &mut self.run;
-        if race.method != drawn {
-            // Comes after the frames that it explains.
-            sink(Event::Note(format!(
-                "render.method = \"auto\": {} from slide {} on, {}",
-                race.method.name(),
-                slide.index + 1,
-                race.why()
-            )));
-            with!(&mut self.session, on => on.picture = Default::default());
-            run.render = drawn_by(&run.plan.scene.render, race.method, run.plan.scene.render.budget);
-            run.progress.seconds_per_sample = None;
-            run.draw_color_bar();
-            run.options.steering.iter().for_each(|steering| steering.keep_method(race.method));
-        }
-        Decision::new("render.method", race.method.name(), race.why()).enter(&mut run.report.decisions);
+        let race = (seconds.len() == METHODS.len()).then(|| Race::of(seconds, slide.index));
+        race.iter().for_each(|race| self.take_method(race, sink));
+        let (run, took) = (&mut self.run, begin.elapsed().as_secs_f64());
         if !run.keeps_surrogate() {
             with!(&mut self.session, on => on.surrogate = None);
             run.learning.resize = None;
+            Decision::withdraw(&mut run.report.decisions, &["surrogate.table_nodes"]);
         }
-        run.report.race = Some(race);
-        if let Some(races) = &mut run.races {
-            *races = Races { is_due: false, count: races.count + 1, ..Races::new(None) };
-        }
-        run.progress.raced += begin.elapsed().as_secs_f64();
+        let (is_due, cost) = if race.is_some() { (false, took) } else { (true, 2.0 * took) };
+        run.races = Some(Races { is_due, count, slide: Some(slide.index), cost, ..Races::new(None) });
+        run.progress.raced += took;
+        run.report.race = race.or(run.report.race.take());
         Ok(())
+    }
+
+    /// Goes on with the method that won.
+    fn take_method(&mut self, race: &Race, sink: &mut Sink<'_>) {
+        let run = &mut self.run;
+        Decision::new("render.method", race.method.name(), race.why()).enter(&mut run.report.decisions);
+        if race.method == run.render.method {
+            return;
+        }
+        sink(Event::Note(format!("render.method = \"auto\": {} from slide {} on, {}", race.method.name(), race.slide + 1, race.why())));
+        with!(&mut self.session, on => on.picture = Default::default());
+        run.render = drawn_by(&run.plan.scene.render, race.method, run.render.budget);
+        run.progress.seconds_per_sample = None;
+        run.draw_color_bar();
+        run.options.steering.iter().for_each(|steering| steering.keep_method(race.method));
     }
 
     /// Seconds from a slide to the target by a method, which draws pictures of its own: those of the slide may be single ones, whose first costs most.
     /// `None` if it never reaches it, or the device has no room for it.
-    fn time_of(&mut self, slide: &Slide, method: Method, drawn: &Pace) -> Result<Option<f64>, RunEnd> {
+    fn time_of(&mut self, slide: &Slide, method: Method, drawn: &Pace) -> Result<Result<Option<f64>, Abandoned>, RunEnd> {
         let serves = method.has_surrogate();
         let tried = with!(&mut self.session, on => {
             let built = if serves && on.surrogate.is_none() { self.run.build_surrogate(on) } else { Ok(()) };
@@ -267,14 +307,16 @@ impl<B: Backend> Cycle<'_, B> {
                 let surrogate = self.run.progress.surrogate_seconds;
                 let others = if self.run.render.method.has_surrogate() { (drawn.prepared - surrogate).max(0.0) } else { drawn.prepared };
                 let prepared = if serves { others + surrogate } else { others };
-                Ok(Pace { prepared, ..pace }.seconds_to(TARGET, method))
+                Ok(Ok(Pace { prepared, ..pace }.seconds_to(TARGET, method)))
+            }
+            Err(RunEnd::Device(error)) if error.is_refusal() => {
+                tracing::info!("{} does not race: {error}", method.name());
+                Ok(Ok(None))
             }
             Err(RunEnd::Device(error)) => {
-                tracing::info!("{} does not race: {error}", method.name());
-                if !error.is_refusal() {
-                    self.session.recover(error, slide, &self.map, &mut self.run)?;
-                }
-                Ok(None)
+                // What was measured is of another device.
+                self.session.recover(error, slide, &self.map, &mut self.run)?;
+                Ok(Err(Abandoned))
             }
             Err(end) => Err(end),
         }
@@ -322,19 +364,26 @@ mod tests {
 
     #[test]
     fn a_race_takes_a_tenth_of_the_time_and_comes_again_when_the_window_changes() {
-        let pace = |seconds: f64| Pace { prepared: 0.0, frames: 1, drawn: seconds, last: seconds, psnr: Some(40.0) };
+        let method = Some(Method::TwoLevel);
+        let pace = |seconds: f64| Pace { method, prepared: 0.0, frames: 1, drawn: seconds, last: seconds, psnr: Some(40.0) };
         let mut races = Races { since: Instant::now() - std::time::Duration::from_secs(100), ..Races::new(None) };
-        races.look_at(Method::TwoLevel, &pace(1.0));
-        assert_eq!((races.allow(9.9), races.allow(10.2)), (true, false));
-        (races.is_due, races.then) = (false, None);
+        races.look_at(0, Method::TwoLevel, &pace(1.0));
+        assert_eq!((races.allow(9.9).is_some(), races.allow(10.2)), (true, None));
+        races.cost = 11.0;
+        assert_eq!(races.allow(1.0), None, "the last one took longer");
+        (races.is_due, races.then, races.cost, races.slide) = (false, None, 0.0, Some(1));
+        races.look_at(1, Method::TwoLevel, &pace(9.0));
+        assert_eq!(races.then, None, "a slide with a race tells nothing");
         for (seconds, is_due) in
             [(1.0, false), (1.9, false), (2.1, false), (0.4, false), (1.9, false), (2.1, false), (2.1, false), (0.4, true)]
         {
-            races.look_at(Method::TwoLevel, &pace(seconds));
-            assert_eq!(races.allow(1.0), is_due, "{seconds}");
+            races.look_at(2, Method::TwoLevel, &pace(seconds));
+            assert_eq!(races.is_due, is_due, "{seconds}");
         }
         let mut slower = Races { is_due: false, then: Some(1.0), differ: 0, ..races };
-        (0..3).for_each(|_| slower.look_at(Method::Reference, &Pace { psnr: None, ..pace(0.4) }));
+        (0..3).for_each(|_| slower.look_at(2, Method::Reference, &pace(0.4)));
+        assert!(!slower.is_due, "what another method took tells nothing");
+        (0..3).for_each(|_| slower.look_at(2, Method::Reference, &Pace { method: Some(Method::Reference), psnr: None, ..pace(0.4) }));
         assert!(slower.is_due, "a method without a stated error is judged by its frames");
         let earlier = Race::of(vec![(Method::TwoLevel, Some(1.0))], 0);
         assert!(!Races::new(Some(&earlier)).is_due, "an earlier run's race counts");

@@ -168,6 +168,9 @@ pub struct StageSeconds {
     pub slide: f64,
     /// Waiting for snapshots.
     pub waiting: f64,
+    /// Races of methods since the last frame, with `render.method = "auto"`.
+    #[serde(default)]
+    pub race: f64,
     /// Tracing nodes of a finer table, before the frame.
     #[serde(default)]
     pub refine: f64,
@@ -188,7 +191,7 @@ pub struct StageSeconds {
     /// Pause for a checkpoint's copy before the frame.
     #[serde(default)]
     pub checkpoint: f64,
-    /// The frame without `waiting` and `slide`, with `checkpoint`.
+    /// The frame without `waiting`, `slide` and `race`, with `checkpoint`.
     pub total: f64,
     /// Since the run began, including reading and preparation.
     #[serde(default)]

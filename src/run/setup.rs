@@ -61,6 +61,12 @@ pub(crate) fn auto_steps(is_gridded: bool, interpolation: Interpolation) -> Step
 }
 
 impl Setup {
+    /// The method of the first frame.
+    pub fn first_method(&self) -> Method {
+        let raced = self.earlier_race.as_ref().filter(|_| self.plan.races).map(|race| race.method);
+        raced.unwrap_or(self.plan.scene.render.method)
+    }
+
     /// Opens the source and chooses the settings that the scene leaves open. An archive is taken as it is now.
     ///
     /// # Errors

@@ -98,7 +98,8 @@ export function address(path, token, query) {
 async function get(url, limit, signal) {
   let answer;
   try {
-    answer = await fetch(url, { signal: AbortSignal.any([AbortSignal.timeout(limit), ...(signal ? [signal] : [])]) });
+    const timeout = AbortSignal.timeout(limit);
+    answer = await fetch(url, { signal: signal ? AbortSignal.any([timeout, signal]) : timeout });
   } catch (error) {
     throw new Error(error.name === "TimeoutError" ? "the server did not answer in time" : "the server is not reached", { cause: error });
   }

@@ -18,6 +18,9 @@ pub enum NoField {
     /// What was asked for is no longer kept.
     #[error("{0}")]
     Gone(String),
+    /// There is no memory for it now.
+    #[error("{0}")]
+    NoRoom(String),
     /// The system refuses.
     #[error("{0}")]
     System(String),

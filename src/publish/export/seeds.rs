@@ -109,6 +109,11 @@ impl NewestSlide {
         *self.lock() = Some(Kept { index: slide.index, time: slide.time, date: slide.date.clone(), velocity, plan });
     }
 
+    /// Number of the slide that is kept.
+    pub fn index(&self) -> Option<u64> {
+        self.lock().as_ref().map(|kept| kept.index)
+    }
+
     /// The slide of this number, or the newest one, to be traced. Its window is kept as long as what is returned.
     ///
     /// # Errors
@@ -135,7 +140,7 @@ impl NewestSlide {
             let why = format!(
                 "its window may have to be kept beside those of the run: {window:.2} GiB, and {free:.2} GiB are free; accepted: half"
             );
-            return Err(NoField::System(why));
+            return Err(NoField::NoRoom(why));
         }
         let slide = Slide { index, time: kept.time, date: kept.date.clone(), live: None, velocity, warnings: Vec::new(), waited: 0.0 };
         Ok(SlideField { plan: kept.plan.clone(), slide })
