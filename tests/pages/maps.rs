@@ -18,7 +18,8 @@ fn every_field_of_the_record_has_its_row() {
     let rows: String = page.lines().filter(|line| line.starts_with("| `")).collect();
     for name in ["MapRecord", "RidgeRecord", "PanelRecord"] {
         let fields = fields("src/map/record.rs", name);
-        assert!(fields.len() >= 4, "{name}: {fields:?}");
+        // That of ridges has two.
+        assert!(fields.len() >= 2, "{name}: {fields:?}");
         for field in fields {
             assert!(rows.contains(&format!("`{field}`")), "{name}: docs/maps.md has no `{field}`");
         }
