@@ -1,10 +1,10 @@
 //! The panels of a chart as one picture, drawn by plotters.
 
-use super::ftle::{FtlePanel, FtlePoint};
+use super::Chart;
+use super::ftle::{CHARGED, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel};
 use super::scaling::ScalingPanel;
-use super::verdict::{CHARGED, size};
-use super::{Chart, front, pick};
+use super::verdict::size;
 use image::{ImageFormat, RgbImage};
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
@@ -123,9 +123,7 @@ fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl 
             None => series.push(Series { name: point.method.clone(), points: vec![(*x, *y)], is_line: false }),
         }
     }
-    // Points that fail are on no front.
-    let error = |point: &FtlePoint| if point.is_sound(panel.points) { point.rms } else { f64::INFINITY };
-    let sound: Vec<[f64; 2]> = panel.methods.iter().map(|point| [cost(point), error(point)]).collect();
+    let (front, pick) = panel.front(cost);
     let label = |i: usize| (at[i][0], at[i][1], format!("{}, {}", panel.methods[i].setting, size(panel.methods[i].bytes)));
     Panel {
         title,
@@ -133,8 +131,8 @@ fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl 
         y: format!("root mean square error of the FTLE{unit}"),
         is_y_log: true,
         series,
-        front: front(&sound).into_iter().map(label).collect(),
-        pick: pick(&sound, panel.tolerance).map(|i| (at[i][0], at[i][1])),
+        front: front.into_iter().map(label).collect(),
+        pick: pick.map(|i| (at[i][0], at[i][1])),
         levels: vec![(panel.tolerance, "tolerance".into())],
     }
 }

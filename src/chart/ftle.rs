@@ -1,7 +1,6 @@
 //! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
 
 use super::slides::FirstSlides;
-use super::verdict::CHARGED;
 use super::{Charting, device_name, failed, front, pick, with_method};
 use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
@@ -21,6 +20,8 @@ use std::time::Instant;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
 
+/// Numbers of samples for which building is charged.
+pub(super) const CHARGED: [f64; 3] = [1e6, 1e9, 1e11];
 /// Most points on which errors are measured.
 const MAX_POINTS: usize = 1 << 20;
 /// Fewest of them.
@@ -106,12 +107,13 @@ pub struct Front {
     pub pick: Option<usize>,
 }
 
-impl Front {
-    fn of(methods: &[FtlePoint], points: usize, tolerance: f64, samples: f64) -> Self {
+impl FtlePanel {
+    /// Places of the methods on the front of error and cost, and that of the cheapest within the tolerance.
+    pub(super) fn front(&self, cost: impl Fn(&FtlePoint) -> f64) -> (Vec<usize>, Option<usize>) {
         // Points that fail are on no front.
-        let error = |point: &FtlePoint| if point.is_sound(points) { point.rms } else { f64::INFINITY };
-        let at: Vec<[f64; 2]> = methods.iter().map(|point| [point.seconds(samples), error(point)]).collect();
-        Self { samples, methods: front(&at), pick: pick(&at, tolerance) }
+        let error = |point: &FtlePoint| if point.is_sound(self.points) { point.rms } else { f64::INFINITY };
+        let at: Vec<[f64; 2]> = self.methods.iter().map(|point| [cost(point), error(point)]).collect();
+        (front(&at), pick(&at, self.tolerance))
     }
 }
 
@@ -284,8 +286,7 @@ impl Bench<'_, '_> {
         let answer = |points: &Points| {
             let mut traced = Traced::default();
             tracer.trace(&points.domain, Extras::default(), &mut traced).map_err(failed)?;
-            let single = || traced.log_stretch.iter().map(|s| f64::from(*s)).collect();
-            Ok(if traced.log_stretch_f64.is_empty() { single() } else { traced.log_stretch_f64 })
+            Ok(traced.unrounded())
         };
         let mut traced = Traced::default();
         self.measure(method, setting, built, answer, |_, seeds| tracer.seconds(seeds, &mut traced).map_err(failed))
@@ -370,16 +371,20 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             networks(&mut bench, &mut backend)?;
         }
     }
-    let (points, tolerance) = (bench.points.unit.len(), opened.plan.scene.trust.tolerance * ramp);
-    Ok(FtlePanel {
-        points,
+    let mut panel = FtlePanel {
+        points: bench.points.unit.len(),
         truth: "Dormand-Prince 5(4), f64, tolerance 1e-10".into(),
         truth_rms,
-        tolerance,
+        tolerance: opened.plan.scene.trust.tolerance * ramp,
         chosen_steps,
-        fronts: CHARGED.map(|samples| Front::of(&bench.found, points, tolerance, samples)).to_vec(),
         methods: bench.found,
-    })
+        fronts: Vec::new(),
+    };
+    for samples in CHARGED {
+        let (methods, pick) = panel.front(|point| point.seconds(samples));
+        panel.fronts.push(Front { samples, methods, pick });
+    }
+    Ok(panel)
 }
 
 /// Range of the FTLE over the colour ramp: that of the scene, or as the program would choose it.

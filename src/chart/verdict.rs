@@ -1,12 +1,9 @@
 //! What a chart says, in words.
 
 use super::Chart;
-use super::ftle::{Front, FtlePanel, FtlePoint};
+use super::ftle::{CHARGED, Front, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel, RESOLVED, TARGETS};
 use crate::render::Method;
-
-/// Numbers of samples for which building is charged.
-pub(super) const CHARGED: [f64; 3] = [1e6, 1e9, 1e11];
 
 /// Sentences about the front, the picks, and where each method wins.
 pub fn verdict(chart: &Chart) -> Vec<String> {

@@ -1,4 +1,4 @@
-//! The FTLE field of the slide that the run shows, as a file. It is traced beside the run, on few threads, for one page at a time.
+//! The FTLE field of the slide that the run shows, as a file. It is traced beside the run, on few threads, one at a time for all pages.
 
 use super::access::parameter;
 use super::pixels::{ELSEWHERE, Pixels, Refusal, Sent, no_field, refused, whole};

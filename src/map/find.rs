@@ -4,7 +4,7 @@ use super::footprint::MapTracer;
 use super::lines::RidgeLine;
 use super::make::{MOST_NODES, about, nodes_in_cell, ridge_field, ridge_nodes, structures};
 use super::ridges::Strength;
-use super::smoothing::{ROUGH, roughness};
+use super::smoothing::{roughness, too_coarse};
 use super::surface_files::SurfacesAbout;
 use super::surfaces::Surfaces;
 use super::view::{View, is_geographic};
@@ -186,17 +186,6 @@ pub fn find(
     let about = SurfacesAbout { shared: about(moment, rate, level), time: moment.time, tau, direction: map.direction };
     let notes = tracer.note.take().into_iter().chain(too_coarse(roughness, "--grid")).collect();
     Ok(FoundRidges { ridges, about, record, notes })
-}
-
-/// What is said of a grid, of this option, that does not resolve the FTLE.
-pub(super) fn too_coarse(roughness: f64, option: &str) -> Option<String> {
-    (roughness > ROUGH).then(|| {
-        format!(
-            "the grid is too coarse for this FTLE: from node to node it changes by {:.0} % of its spread, so that ridges are lost, torn or misplaced; take \
-             a finer {option}, or a shorter tau",
-            100.0 * roughness
-        )
-    })
 }
 
 /// Nodes of a volume, evenly spaced, at least 16 along each axis.

@@ -2,6 +2,9 @@
 
 use rayon::prelude::*;
 
+/// Roughness from which on a grid is too coarse.
+const ROUGH: f64 = 0.4;
+
 /// A field of `size` nodes (first axis fastest) after a Gaussian with this standard deviation in nodes, over the known nodes only; missing nodes stay
 /// missing.
 pub(super) fn smoothed(values: &[f32], size: &[usize], deviation: f64) -> Vec<f64> {
@@ -49,9 +52,6 @@ pub(super) fn roughness(values: &[f32], size: &[usize]) -> f64 {
     if variance > 0.0 && differences[0] > 0.0 { (differences[1] / differences[0] / variance).sqrt() } else { 0.0 }
 }
 
-/// Roughness from which on a grid is too coarse.
-pub(super) const ROUGH: f64 = 0.4;
-
 /// Whether cells of so many nodes resolve a field in two dimensions: every such node alone would.
 pub(super) fn is_resolved(values: &[f32], size: [usize; 2], nodes: [f64; 2]) -> bool {
     let counts = [0, 1].map(|k| ((size[k] - 1) as f64 / nodes[k]) as usize + 1);
@@ -61,6 +61,17 @@ pub(super) fn is_resolved(values: &[f32], size: [usize; 2], nodes: [f64; 2]) -> 
     let at = |k: usize, n: usize| ((n as f64 * nodes[k]).round() as usize).min(size[k] - 1);
     let of_cells: Vec<f32> = (0..counts[0] * counts[1]).map(|n| values[at(1, n / counts[0]) * size[0] + at(0, n % counts[0])]).collect();
     roughness(&of_cells, &counts) < ROUGH
+}
+
+/// What is said of a grid, of this option, that does not resolve the FTLE.
+pub(super) fn too_coarse(roughness: f64, option: &str) -> Option<String> {
+    (roughness > ROUGH).then(|| {
+        format!(
+            "the grid is too coarse for this FTLE: from node to node it changes by {:.0} % of its spread, so that ridges are lost, torn or misplaced; take \
+             a finer {option}, or a shorter tau",
+            100.0 * roughness
+        )
+    })
 }
 
 /// Count, sum and sum of squares of the finite values.

@@ -1,7 +1,6 @@
 //! The film: means, variances and shares per pixel, by the running updates of Welford (1962) and Chan, Golub and LeVeque (1979).
 
 use super::RenderError;
-use super::smooth::{LIT, squared_slope};
 
 /// A picture: one entry per pixel, rows from the top, left to right.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -243,18 +242,6 @@ impl Pixel {
         film.queries[i] = self.queries as f32;
         film.traced[i] = if self.queries == 0.0 { 0.0 } else { (self.traced / self.queries) as f32 };
     }
-}
-
-/// PSNR over lit pixels, in decibels, of the mean of two independent pictures, from their difference. `tone_map` is `[contrast, brightness, gamma]`.
-pub fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
-    let (mut sum, mut lit) = (0.0, 0.0);
-    for (a, b) in a.rgba.iter().zip(&b.rgba).filter(|(a, b)| a[3] + b[3] > 2.0 * LIT) {
-        lit += 1.0;
-        for (a, b) in a[..3].iter().zip(&b[..3]) {
-            sum += f64::from(squared_slope(tone_map, 0.5 * (a + b))) * f64::from(0.5 * (a - b)).powi(2) / 3.0;
-        }
-    }
-    -10.0 * (sum / lit).max(1e-12).log10()
 }
 
 #[cfg(test)]

@@ -30,7 +30,7 @@ pub mod rng;
 pub use albedo::{ALBEDO_PRESETS, albedo_preset};
 pub use camera::Camera;
 pub use error::RenderError;
-pub use film::{Film, PixelValue, noise_psnr};
+pub use film::{Film, PixelValue};
 pub use light::Light;
 pub use majorant::{CellObservations, MajorantGrid};
 pub use map_picture::{MAP_TONE, MapPicture, footprint, map_radiance, viridis};

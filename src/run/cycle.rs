@@ -4,8 +4,8 @@
 //! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
 //! with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
-use super::another_map::asked;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
+use super::commands::Commands;
 use super::decision::{Decision, enter_colours, why_steps};
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
@@ -13,7 +13,7 @@ use super::refine::Frames;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{LOOK_UP, Slide, Slides};
-use super::steering::{Command, Range, Steering, drawn_by};
+use super::steering::{Command, Steering, drawn_by};
 use super::steps::{PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
@@ -24,7 +24,7 @@ use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::progress;
-use crate::render::{MAX_FRAMES_UNTIL, Method, RenderError, RenderSettings, Renderer, Scene, Target};
+use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
@@ -159,7 +159,7 @@ pub(super) struct Run<'a> {
     /// `[render]` with the method and the budget that commands set.
     pub(super) render: RenderSettings,
     /// The newest budget, also while the method has none.
-    budget: Option<f64>,
+    pub(super) budget: Option<f64>,
     pub(super) transfer: TransferRecord,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
@@ -280,20 +280,6 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) frames_before: usize,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
     pub(super) settled: Option<(StepChoice, PictureSteps)>,
-}
-
-/// What commands changed since the last frame, by what follows from it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Commands {
-    None,
-    /// The camera, or whether the window stands still.
-    View,
-    /// The method: the picture begins anew.
-    Method,
-    /// The ramp or the tolerance too, by which steps are chosen.
-    Colours,
-    /// Tau or direction: all that was traced is of another flow map.
-    Map,
 }
 
 /// Place of a frame in its slide.
@@ -718,6 +704,9 @@ impl<B: Backend> Cycle<'_, B> {
             if commands > Commands::None {
                 since_command = Some(0);
             }
+            if commands >= Commands::Colours {
+                self.run.races.iter_mut().for_each(Races::begin_anew);
+            }
             // The seeds of a map are those of any colours.
             let keeps_picture = commands == Commands::Colours && self.run.render.method == Method::Map;
             if commands >= Commands::Method && !keeps_picture {
@@ -890,81 +879,6 @@ impl Run<'_> {
     /// Whether a command waits, or one comes within `limit`.
     pub(super) fn is_commanded_within(&self, limit: Duration) -> bool {
         self.options.steering.as_ref().is_some_and(|steering| steering.is_pending_within(limit))
-    }
-
-    /// Applies the commands that came since the last frame, and returns what they changed. A picture that accumulates notices what it no longer shows,
-    /// and starts anew.
-    fn apply_commands(&mut self) -> Commands {
-        let Some(steering) = &self.options.steering else { return Commands::None };
-        let mut changed = Commands::None;
-        for command in steering.take() {
-            let set = &command.set;
-            changed = changed.max(match set {
-                _ if set.tau.is_some_and(|tau| tau != self.asked.tau) => Commands::Map,
-                _ if set.direction.is_some_and(|direction| direction != self.asked.direction) => Commands::Map,
-                _ if set.range.is_some() || set.tolerance.is_some() => Commands::Colours,
-                _ if set.method.is_some_and(|method| method != self.render.method) => Commands::Method,
-                _ => Commands::View,
-            });
-            match self.apply(&command) {
-                Ok(()) => self.progress.commands.push(command),
-                Err(refused) => self.progress.warnings.push(format!("command {} had no effect: {refused}", command.number)),
-            }
-        }
-        changed
-    }
-
-    /// Takes no more commands. Those that no frame shows are told.
-    fn end_commands(&mut self) {
-        let mut late = std::mem::take(&mut self.progress.commands);
-        late.extend(self.options.steering.iter().flat_map(|steering| steering.end()));
-        if let (Some(first), Some(last)) = (late.first(), late.last()) {
-            self.progress.warnings.push(format!("commands {} to {} came too late: no frame shows them", first.number, last.number));
-        }
-    }
-
-    fn apply(&mut self, Command { set, .. }: &Command) -> Result<(), RenderError> {
-        if set.camera.is_some() || set.range.is_some() {
-            let mut scene = self.renderer.scene().clone();
-            scene.camera = set.camera.clone().unwrap_or(scene.camera);
-            if let Some(Range { low, high }) = set.range {
-                (scene.transfer.low, scene.transfer.high) = (Some(low), Some(high));
-            }
-            let renderer = &mut self.renderer;
-            self.threads.render().install(|| renderer.set_scene(scene))?;
-        }
-        if let Some(Range { low, high }) = set.range {
-            Decision::withdraw(&mut self.report.decisions, &["transfer.low", "transfer.high"]);
-            self.transfer = TransferRecord { low, high, ..self.transfer };
-            self.report.transfer = Some(self.transfer);
-            // Its residuals are those of another ramp.
-            self.learning.trust.reset();
-        }
-        self.has_range |= set.range.is_some();
-        // The flow map follows once all commands are applied.
-        self.asked = asked(&self.plan.map, &self.asked, set);
-        let is_other = set.range.is_some() || set.tolerance.is_some() || set.tau.is_some() || set.direction.is_some();
-        self.races.iter_mut().filter(|_| is_other).for_each(Races::begin_anew);
-        if set.method.is_some() || set.budget.is_some() {
-            self.races = None;
-        }
-        if let Some(method) = set.method {
-            Decision::withdraw(&mut self.report.decisions, &["render.method"]);
-            // Of another method.
-            self.progress.seconds_per_sample = None;
-            // A budget waits for the method that has one.
-            self.render = drawn_by(&self.plan.scene.render, method, self.budget);
-        }
-        if let Some(budget) = set.budget {
-            self.budget = Some(budget);
-            // Since it was accepted, a race may have gone on with a method that has none.
-            self.render = drawn_by(&self.plan.scene.render, self.render.method, self.budget);
-        }
-        if let Some(tolerance) = set.tolerance {
-            self.learning.trust.set_tolerance(tolerance);
-        }
-        self.draw_color_bar();
-        Ok(())
     }
 
     pub(super) fn draw_color_bar(&mut self) {

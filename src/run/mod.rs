@@ -7,6 +7,7 @@ mod another_map;
 mod assess;
 mod checkpoints;
 mod color_bar;
+mod commands;
 mod cycle;
 mod decision;
 mod default_tau;

@@ -12,8 +12,8 @@ use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present, with};
 use super::{Event, FrameRecord};
 use crate::backend::{Backend, FrameJob, Rendered, Routing, Surrogate};
-use crate::render::smooth::PictureError;
-use crate::render::{Method, noise_psnr};
+use crate::render::Method;
+use crate::render::smooth::{PictureError, noise_psnr};
 use crate::surrogate::Kind;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -84,9 +84,6 @@ pub(super) struct Races {
     /// Seconds that the last one took, or twice those after which it was given up.
     cost: f64,
 }
-
-/// A race is given up: it takes too long, or the device was lost.
-struct Abandoned;
 
 impl Race {
     /// Of the seconds from a slide to a PSNR in decibels, by method; `None` if no method reaches the target.
@@ -257,10 +254,17 @@ impl<B: Backend> Cycle<'_, B> {
         let mut seconds = Vec::new();
         for method in METHODS {
             // What a method takes is known afterwards only.
-            let is_late = begin.elapsed().as_secs_f64() > room;
-            match if is_late { Err(Abandoned) } else { self.time_of(slide, method, pace)? } {
+            if begin.elapsed().as_secs_f64() > room {
+                break;
+            }
+            match self.time_of(method, pace) {
                 Ok(time) => seconds.push((method, time)),
-                Err(Abandoned) => break,
+                Err(RunEnd::Device(error)) => {
+                    // What was measured is of another device.
+                    self.session.recover(error, slide, &self.map, &mut self.run)?;
+                    break;
+                }
+                Err(end) => return Err(end),
             }
         }
         let race = (seconds.len() == METHODS.len()).then(|| Race::of(seconds, slide.index));
@@ -270,6 +274,9 @@ impl<B: Backend> Cycle<'_, B> {
             with!(&mut self.session, on => on.surrogate = None);
             run.learning.resize = None;
             Decision::withdraw(&mut run.report.decisions, &["surrogate.table_nodes"]);
+        } else if !has_surrogate {
+            // Its residuals are those of windows before `reference` drew.
+            run.learning.trust.reset();
         }
         let (is_due, cost) = if race.is_some() { (false, took) } else { (true, 2.0 * took) };
         run.races = Some(Races { is_due, count, slide: Some(slide.index), cost, ..Races::new(None) });
@@ -295,7 +302,7 @@ impl<B: Backend> Cycle<'_, B> {
 
     /// Seconds from a slide to the target by a method, which draws pictures of its own: those of the slide may be single ones, whose first costs most.
     /// `None` if it never reaches it, or the device has no room for it.
-    fn time_of(&mut self, slide: &Slide, method: Method, drawn: &Pace) -> Result<Result<Option<f64>, Abandoned>, RunEnd> {
+    fn time_of(&mut self, method: Method, drawn: &Pace) -> Result<Option<f64>, RunEnd> {
         let serves = method.has_surrogate();
         let tried = with!(&mut self.session, on => {
             let built = if serves && on.surrogate.is_none() { self.run.build_surrogate(on) } else { Ok(()) };
@@ -307,16 +314,11 @@ impl<B: Backend> Cycle<'_, B> {
                 let surrogate = self.run.progress.surrogate_seconds;
                 let others = if self.run.render.method.has_surrogate() { (drawn.prepared - surrogate).max(0.0) } else { drawn.prepared };
                 let prepared = if serves { others + surrogate } else { others };
-                Ok(Ok(Pace { prepared, ..pace }.seconds_to(TARGET, method)))
+                Ok(Pace { prepared, ..pace }.seconds_to(TARGET, method))
             }
             Err(RunEnd::Device(error)) if error.is_refusal() => {
                 tracing::info!("{} does not race: {error}", method.name());
-                Ok(Ok(None))
-            }
-            Err(RunEnd::Device(error)) => {
-                // What was measured is of another device.
-                self.session.recover(error, slide, &self.map, &mut self.run)?;
-                Ok(Err(Abandoned))
+                Ok(None)
             }
             Err(end) => Err(end),
         }

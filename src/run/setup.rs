@@ -279,7 +279,7 @@ fn of_volumes(scene: &Settings) -> Vec<&'static str> {
     set.into_iter().filter(|(is_set, _)| *is_set).map(|(_, key)| key).collect()
 }
 
-/// What is said of keys that a map ignores. They do not make the default method another one, if they are not of volumes alone.
+/// What is said of the keys of the scene that a map ignores.
 fn unused_by_maps(scene: &Settings) -> Option<String> {
     let (render, default) = (&scene.render, RenderSettings::default());
     if render.method != Method::Map {

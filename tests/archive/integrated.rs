@@ -1,6 +1,6 @@
 //! The FTLE of archives beside an integration by other tools, tests/independent/ftle.py: with the same interpolant, and as a scene has it by default.
 
-use crate::kit::flow::{quasi_random, stretches, trace, window};
+use crate::kit::flow::{quasi_random, trace, window};
 use crate::kit::netcdf::*;
 use crate::kit::program::{self, project};
 use crate::kit::scene;
@@ -78,7 +78,7 @@ impl Compared<'_> {
         });
         let output = program::run_with_input(Command::new(python).arg(project("tests/independent/ftle.py")), &task.to_string()).success();
         let theirs: Vec<serde_json::Value> = serde_json::from_str(&output.stdout).unwrap();
-        let all = stretches(&out);
+        let all = out.unrounded();
         let (ours, numbers): (Vec<f64>, Vec<f64>) =
             chosen.iter().zip(&theirs).filter_map(|(&i, theirs)| theirs.as_f64().map(|t| (all[i], t))).unzip();
         println!("{}: {} of {} points are left out, since a neighbour stops", self.kind, theirs.len() - PAIRS, theirs.len());

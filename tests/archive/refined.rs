@@ -2,7 +2,7 @@
 //! space and an integration of its own.
 
 use crate::integrated::default_map;
-use crate::kit::flow::{quasi_random, stretches, trace, window};
+use crate::kit::flow::{quasi_random, trace, window};
 use crate::kit::netcdf::*;
 use crate::{HOURS, inspected, notes, open, open_with};
 use ridgewatch::field::{DomainPoint, EARTH_RADIUS, Snapshot};
@@ -217,7 +217,7 @@ fn errors(sea: &Sea, archive: &mut Archive, file: &Path) -> [f64; 4] {
     let [linear, default] = [linear, default].map(|map| {
         let traced = trace(&VelocitySource::Window(window.clone()), &map, begin, &seeds, Extras::default());
         assert!(traced.lifetime_share.iter().all(|&share| share == 1.0), "a particle stopped");
-        relative(&stretches(&traced).into_iter().zip(truth.iter().copied()).collect::<Vec<_>>())
+        relative(&traced.unrounded().into_iter().zip(truth.iter().copied()).collect::<Vec<_>>())
     });
     [compare(&|x, y| sea.in_mesh(x, y)), compare(&|x, y| (sea.flow)(x, y)), linear, default]
 }

@@ -1,6 +1,6 @@
 //! FTLE against closed forms, against the reference integrator, and between settings that must agree.
 
-use crate::kit::flow::{EVERYTHING, stretches, trace};
+use crate::kit::flow::{EVERYTHING, trace};
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
@@ -96,7 +96,7 @@ fn linear_flows_equal_their_closed_forms() {
             ] {
                 // Step times rate is 0.01.
                 let map = FlowMap { direction, ..map(5.0, 400, precision) };
-                for s in stretches(&run(&VelocitySource::Analytic(flow.clone(), square()), &map, 0.3, &seeds)) {
+                for s in run(&VelocitySource::Analytic(flow.clone(), square()), &map, 0.3, &seeds).unrounded() {
                     // Relative error for saddle and shear, absolute error for the rotation.
                     let error = (s - expected).abs() / if expected == 0.0 { 1.0 } else { expected };
                     assert!(error < tolerance, "{flow:?} {direction:?} {precision:?}: {s} {expected} {error:e}");
@@ -113,11 +113,11 @@ fn long_windows_do_not_overflow() {
     let seeds = [[0.25, 0.5, 0.0], [0.0, 0.0, 0.0]].map(DomainPoint);
     // Step times rate 0.1: truncation z^4 / 120 = 8e-7 relative; in single precision half an ulp in every step of 0.1.
     for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::F64, 1e-6)] {
-        for s in stretches(&run(&source, &map(100.0, 10_000, precision), 0.0, &seeds)) {
+        for s in run(&source, &map(100.0, 10_000, precision), 0.0, &seeds).unrounded() {
             assert!((s / 1000.0 - 1.0).abs() < tolerance, "{precision:?} {s}");
         }
     }
-    let s = stretches(&run(&source, &reference(100.0), 0.0, &seeds[1..]))[0];
+    let s = run(&source, &reference(100.0), 0.0, &seeds[1..]).unrounded()[0];
     assert!((s / 1000.0 - 1.0).abs() < 1e-8, "{s}: local errors of 1e-10 add up over some thousand steps");
 }
 
@@ -129,16 +129,16 @@ fn double_gyre_and_abc_against_the_reference() {
         ("unsteady ABC", abc(0.5), 5.0, 300, [9, 9, 9]),
     ] {
         let seeds = lattice(&domain, counts);
-        let exact = stretches(&run(&source, &reference(tau), 0.0, &seeds));
+        let exact = run(&source, &reference(tau), 0.0, &seeds).unrounded();
         // Truncation at these steps; in single precision rounding of the path, which grows with the stretch (up to e^8 here).
         for (precision, tolerance) in [(Precision::F64, 1e-5), (Precision::F32, 3e-4)] {
-            let found = stretches(&run(&source, &map(tau, steps, precision), 0.0, &seeds));
+            let found = run(&source, &map(tau, steps, precision), 0.0, &seeds).unrounded();
             let (rms, max) = rms_and_max(&found, &exact);
             println!("{name}, tangent {precision:?}, {steps} steps: log-stretch rms {rms:.2e}, max {max:.2e}");
             assert!(rms < tolerance, "{name} {precision:?}: {rms:e}");
         }
         let differences = FlowMap { integrator: Integrator::Differences, difference_step: 1e-5, ..map(tau, steps, Precision::F64) };
-        let errors = sorted_errors(&stretches(&run(&source, &differences, 0.0, &seeds)), &exact);
+        let errors = sorted_errors(&run(&source, &differences, 0.0, &seeds).unrounded(), &exact);
         let median = errors[errors.len() / 2];
         println!("{name}, differences F64, gap 1e-5: log-stretch median {median:.2e}, max {:.2e}", errors[errors.len() - 1]);
         // gap^2 times third over first derivatives of the flow map.
@@ -152,10 +152,10 @@ fn fourth_order_in_the_step() {
         [("double gyre", double_gyre(), 10.0, [40, 20, 1], 40), ("unsteady ABC", abc(0.5), 4.0, [8, 8, 8], 80)]
     {
         let seeds = lattice(&domain, counts);
-        let exact = stretches(&run(&source, &reference(tau), 0.0, &seeds));
+        let exact = run(&source, &reference(tau), 0.0, &seeds).unrounded();
         // The median: a few chaotic paths, which converge late, dominate the mean.
         let median = |factor: usize| {
-            let errors = sorted_errors(&stretches(&run(&source, &map(tau, factor * steps, Precision::F64), 0.0, &seeds)), &exact);
+            let errors = sorted_errors(&run(&source, &map(tau, factor * steps, Precision::F64), 0.0, &seeds).unrounded(), &exact);
             errors[errors.len() / 2]
         };
         let errors = [1, 2, 4].map(median);
@@ -221,8 +221,8 @@ fn gridded_tangent_is_the_derivative_of_the_gridded_flow() {
             for (direction, t0) in [(Direction::Forward, 0.0), (Direction::Backward, 3.0)] {
                 let tangent = FlowMap { boundary: Boundary::Clamp, interpolation, direction, ..map(3.0, 12, Precision::F64) };
                 let differences = FlowMap { integrator: Integrator::Differences, difference_step: 1e-7, ..tangent.clone() };
-                let exact = stretches(&run(&source, &tangent, t0, &seeds));
-                let errors = sorted_errors(&exact, &stretches(&run(&source, &differences, t0, &seeds)));
+                let exact = run(&source, &tangent, t0, &seeds).unrounded();
+                let errors = sorted_errors(&exact, &run(&source, &differences, t0, &seeds).unrounded());
                 let high = errors[errors.len() * 95 / 100];
                 println!("{name}, {interpolation:?}, {direction:?}: median {:.1e}, 95 % {high:.1e}", errors[errors.len() / 2]);
                 // The error of differences is rounding over the difference step, 1e-8 times the stretch. Pairs on both sides of a cell face
@@ -238,10 +238,10 @@ fn a_fine_grid_comes_near_the_closed_form() {
     let times: Vec<f64> = (0..=80).map(|i| f64::from(i) * 0.125).collect();
     let window = gridded_gyre(even("x", 0.0, 2.0, 321), even("y", 0.0, 1.0, 161), &times);
     let seeds = lattice(&window.grid().unwrap().domain(), [60, 30, 1]);
-    let exact = stretches(&run(&double_gyre().0, &map(10.0, 160, Precision::F64), 0.0, &seeds));
+    let exact = run(&double_gyre().0, &map(10.0, 160, Precision::F64), 0.0, &seeds).unrounded();
     let error = |interpolation| {
         let map = FlowMap { boundary: Boundary::Clamp, interpolation, ..map(10.0, 160, Precision::F32) };
-        rms_and_max(&stretches(&run(&VelocitySource::Window(window.clone()), &map, 0.0, &seeds)), &exact).0
+        rms_and_max(&run(&VelocitySource::Window(window.clone()), &map, 0.0, &seeds).unrounded(), &exact).0
     };
     let (linear, cubic) = (error(Interpolation::Linear), error(Interpolation::Cubic));
     println!("gridded double gyre: linear {linear:.2e}, cubic {cubic:.2e} (log-stretch, rms) from the closed form");
@@ -268,7 +268,7 @@ fn vectors_equal_scalars_and_order_does_not_matter() {
                 let given = run_tracer(&*tracer_in_order(source.clone(), &map, 0.0, Order::Given).unwrap(), &seeds);
                 assert_eq!(sorted.log_stretch, given.log_stretch, "the same numbers, bit by bit");
                 let scalar = run_tracer(&*scalar_tracer(source.clone(), &map, 0.0).unwrap(), &seeds);
-                let errors = sorted_errors(&stretches(&sorted), &stretches(&scalar));
+                let errors = sorted_errors(&sorted.unrounded(), &scalar.unrounded());
                 let high = errors[errors.len() * 99 / 100];
                 // Only logarithms differ; the flow amplifies their different rounding (by up to 1e3).
                 assert!(high < tolerance, "{integrator:?} {precision:?}: {high:e}");
@@ -346,9 +346,9 @@ fn a_periodic_seam_is_a_cell_like_others() {
         let across = run(&make(0), &map, 0.0, &at(30.0));
         let beside = run(&make(18), &map, 0.0, &at(12.0));
         assert!(across.lifetime_share.iter().all(|&l| l == 1.0), "no edge there");
-        let (_, max) = rms_and_max(&stretches(&across), &stretches(&beside));
+        let (_, max) = rms_and_max(&across.unrounded(), &beside.unrounded());
         assert!(max < 1e-12, "{interpolation:?} {max:e}: the same numbers at other places, except for rounding");
-        assert!(stretches(&across)[4] > 0.05, "and there is stretch");
+        assert!(across.unrounded()[4] > 0.05, "and there is stretch");
     }
 }
 
@@ -380,8 +380,8 @@ fn steps_are_chosen_by_error() {
     println!("double gyre, tau 10: {coarse} steps for 1e-1, {fine} for 1e-3");
     assert!(coarse < fine);
     let seeds = lattice(&domain, [50, 25, 1]);
-    let exact = stretches(&run(&source, &reference(10.0), 0.0, &seeds));
-    let (rms, _) = rms_and_max(&stretches(&run(&source, &map(10.0, fine, Precision::F64), 0.0, &seeds)), &exact);
+    let exact = run(&source, &reference(10.0), 0.0, &seeds).unrounded();
+    let (rms, _) = rms_and_max(&run(&source, &map(10.0, fine, Precision::F64), 0.0, &seeds).unrounded(), &exact);
     // 16/15 of the difference to twice as many steps, measured on other points.
     assert!(rms < 1.5e-3, "{rms:e}");
 
@@ -409,7 +409,7 @@ fn steps_on_kinks_are_chosen_by_a_share_of_the_stretch() {
     let with = |steps| FlowMap { boundary: Boundary::Clamp, steps, ..map(1.0, 1, Precision::F64) };
     let error = |steps| {
         let chosen = cpu_tracer(source.clone(), &with(steps), 0.0).unwrap().steps();
-        let of = |steps| stretches(&run(&source, &with(Steps::Fixed(steps)), 0.0, &seeds));
+        let of = |steps| run(&source, &with(Steps::Fixed(steps)), 0.0, &seeds).unrounded();
         let fine = of(16 * chosen);
         let size = (fine.iter().map(|s| s * s).sum::<f64>() / fine.len() as f64).sqrt();
         (chosen, rms_and_max(&of(chosen), &fine).0 / size)
@@ -469,7 +469,7 @@ fn fine_steps_on_a_grid_converge_to_the_reference() {
     let window = turbulence([24, 16, 20], 4);
     let seeds = lattice(&window.grid().unwrap().domain(), [6, 5, 5]);
     let source = VelocitySource::Window(window);
-    let with = |map: FlowMap| stretches(&run(&source, &FlowMap { boundary: Boundary::Clamp, ..map }, 0.0, &seeds));
+    let with = |map: FlowMap| run(&source, &FlowMap { boundary: Boundary::Clamp, ..map }, 0.0, &seeds).unrounded();
     let exact = with(reference(3.0));
     let coarse = rms_and_max(&with(map(3.0, 24, Precision::F64)), &exact).0;
     let fine = rms_and_max(&with(map(3.0, 1536, Precision::F64)), &exact).0;

@@ -1,6 +1,6 @@
 //! Flows on the sphere and over its poles, with and without levels, whose stretch is known.
 
-use crate::kit::flow::{DAY, EVERYTHING, cross, direction, dot, rotation, stretches, trace};
+use crate::kit::flow::{DAY, EVERYTHING, cross, direction, dot, rotation, trace};
 use ridgewatch::field::{Axis, DomainPoint, EARTH_RADIUS, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{Boundary, FlowMap, Integrator, Interpolation, Precision, Traced, VelocitySource};
 use std::f64::consts::TAU;
@@ -93,7 +93,7 @@ fn solid_rotation_about_a_tilted_axis_has_ftle_0() {
         });
         let out = traced(&source, &map(tau, 100, precision, interpolation), &seeds);
         assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "a globe has no edge");
-        let worst = greatest(&stretches(&out), &vec![0.0; seeds.len()]);
+        let worst = greatest(&out.unrounded(), &vec![0.0; seeds.len()]);
         println!("solid rotation, {cell} degrees, {levels} level(s), {precision:?}, {interpolation:?}: |FTLE| at most {worst:.1e} / |tau|");
         assert!(worst < tolerance, "{worst:e}");
         // Rodrigues' formula for a quarter of a turn about a: p' = a x p + (p . a) a.
@@ -121,7 +121,7 @@ fn packed_rotation_has_an_ftle_beside_the_poles() {
             let [u, v] = rotation(rate, TILT, lon, lat).map(|v| (v / step).round() * step);
             [u, v, 0.0]
         });
-        let mut stretch = stretches(&traced(&source, &map(tau, 100, Precision::F64, Interpolation::Cubic), &seeds));
+        let mut stretch = traced(&source, &map(tau, 100, Precision::F64, Interpolation::Cubic), &seeds).unrounded();
         stretch.iter_mut().for_each(|s| *s = s.abs());
         stretch.sort_by(f64::total_cmp);
         let (median, worst) = (stretch[stretch.len() / 2], stretch[stretch.len() - 1]);
@@ -169,7 +169,7 @@ fn rotation_that_turns_faster_above_and_rises_has_a_closed_form() {
         let out = traced(&source, &map, &seeds);
         // The seeds after the first 300 lie beside a pole, where a difference in longitude has no length.
         let count = if integrator == Integrator::Differences { 300 } else { seeds.len() };
-        let worst = greatest(&stretches(&out)[..count], &expected[..count]);
+        let worst = greatest(&out.unrounded()[..count], &expected[..count]);
         println!(
             "turning faster above, {integrator:?}, {precision:?}: off by at most {worst:.1e} of up to {:.2}",
             sheared(EARTH_RADIUS * c * k, e)
@@ -245,7 +245,7 @@ fn solid_rotation_of_the_sphere_does_not_stretch() {
     ] {
         let out = traced(&source, &map(tau, 200, precision, interpolation), &seeds);
         assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "a globe has no edge");
-        let stretch = stretches(&out);
+        let stretch = out.unrounded();
         let rms = (stretch.iter().map(|s| s * s).sum::<f64>() / stretch.len() as f64).sqrt();
         println!(
             "solid rotation, {precision:?}, {interpolation:?}: rms {rms:.1e}, max {:.1e}",
@@ -277,7 +277,7 @@ fn zonal_shear_on_the_sphere_has_a_closed_form() {
         [(Integrator::Tangent, Precision::F32), (Integrator::Tangent, Precision::F64), (Integrator::Differences, Precision::F64)]
     {
         let map = FlowMap { integrator, ..map(tau, 100, precision, Interpolation::Cubic) };
-        let max = greatest(&stretches(&traced(&source, &map, &seeds)), &expected);
+        let max = greatest(&traced(&source, &map, &seeds).unrounded(), &expected);
         println!("zonal shear, {integrator:?}, {precision:?}: max {max:.1e}");
         // Interpolation in cells of half a degree: derivatives are off by the square of a cell, 8e-5, of a g of up to 5.
         assert!(max < 5e-4, "{max:e}");

@@ -16,14 +16,6 @@ pub fn trace(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoi
     out
 }
 
-/// Log-stretches in double precision, whatever the tracer's.
-pub fn stretches(traced: &Traced) -> Vec<f64> {
-    if traced.log_stretch_f64.is_empty() {
-        return traced.log_stretch.iter().map(|&s| f64::from(s)).collect();
-    }
-    traced.log_stretch_f64.clone()
-}
-
 /// All snapshots of an archive.
 pub fn window(archive: &mut Archive) -> Arc<Window> {
     let times = archive.times().to_vec();

@@ -1,6 +1,6 @@
 //! Ridge lines against closed forms and against a finer grid.
 
-use crate::kit::flow::{stretches, trace};
+use crate::kit::flow::trace;
 use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, Window, analytic::Analytic};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, VelocitySource};
 use ridgewatch::map::{Field, RidgePoint, Strength};
@@ -89,7 +89,7 @@ fn the_saddle_of_a_traced_grid_is_exact_to_a_hundredth_of_a_cell() {
     let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
         .map(|k| DomainPoint([(origin[0] + step * (k % size[0]) as f64) as f32, (origin[1] + step * (k / size[0]) as f64) as f32, 0.5]))
         .collect();
-    let traced = stretches(&trace(&VelocitySource::Window(Arc::new(window)), &map, 0.0, &seeds, Extras::default()));
+    let traced = trace(&VelocitySource::Window(Arc::new(window)), &map, 0.0, &seeds, Extras::default()).unrounded();
     for (seed, s) in seeds.iter().zip(&traced) {
         assert!((s - nonlinear_saddle(f64::from(seed.0[0]), 1.0)).abs() < 1e-3, "{seed:?}: {s}");
     }
@@ -169,7 +169,7 @@ fn the_double_gyre_agrees_with_a_grid_four_times_finer() {
         let seeds: Vec<DomainPoint> = (0..size[0] * size[1])
             .map(|k| DomainPoint([(step * (k % size[0]) as f64) as f32, (step * (k / size[0]) as f64) as f32, 0.5]))
             .collect();
-        let values = stretches(&trace(&velocity, &map, 0.0, &seeds, Extras::default())).iter().map(|s| (s / 10.0) as f32).collect();
+        let values = trace(&velocity, &map, 0.0, &seeds, Extras::default()).unrounded().iter().map(|s| (s / 10.0) as f32).collect();
         let strength = Strength { percentile: 80.0, extent: 0.1 * n as f64, ..ALL };
         Field { origin: [0.0; 2], step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] }.ridges(&strength)
     };
@@ -246,7 +246,7 @@ fn the_double_gyre_has_a_ridge_on_its_known_manifold() {
         let place = |k: usize| [origin[0] + step * (k % size[0]) as f64, origin[1] + step * (k / size[0]) as f64];
         let seeds: Vec<DomainPoint> = (0..size[0] * size[1]).map(place).map(|[x, y]| DomainPoint([x as f32, y as f32, 0.5])).collect();
         let traced = trace(&velocity, &map, 0.0, &seeds, Extras::default());
-        let values = stretches(&traced).iter().map(|s| (s / tau) as f32).collect();
+        let values = traced.unrounded().iter().map(|s| (s / tau) as f32).collect();
         let field = Field { origin, step: [step; 2], size, values, scale: vec![[1.0; 2]; size[1]] };
         let ridges = field.ridges(&Strength { percentile: 80.0, extent: 100.0, ..ALL });
         let mut manifold = stable_manifold(tau, 0.02);

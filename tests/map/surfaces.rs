@@ -1,6 +1,6 @@
 //! Ridge surfaces against closed forms: planes, spherical shells, fields without ridges.
 
-use crate::kit::flow::{Vector, dot, stretches, trace, unit};
+use crate::kit::flow::{Vector, dot, trace, unit};
 use ridgewatch::field::{Axis, DomainPoint, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, VelocitySource};
 use ridgewatch::map::{Strength, Surfaces, Volume};
@@ -106,7 +106,7 @@ fn traced(velocity: impl Fn(Vector) -> Vector, map: &FlowMap) -> Volume {
     let mut volume = volume(-0.3011, 0.0257, 24, |_| 0.0);
     let seeds: Vec<DomainPoint> =
         (0..24 * 24 * 24).map(|k| DomainPoint([k % 24, k / 24 % 24, k / 576].map(|i| (-0.3011 + 0.0257 * i as f64) as f32))).collect();
-    let stretch = stretches(&trace(&VelocitySource::Window(Arc::new(window)), map, 0.0, &seeds, Extras::default()));
+    let stretch = trace(&VelocitySource::Window(Arc::new(window)), map, 0.0, &seeds, Extras::default()).unrounded();
     volume.values = stretch.iter().map(|s| (s / map.tau) as f32).collect();
     volume.rounding = 1e-5 / map.tau;
     volume

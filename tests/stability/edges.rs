@@ -1,6 +1,6 @@
 //! Edges of data: poles and the dateline, coasts, open boundaries.
 
-use crate::kit::flow::{DAY, EVERYTHING, quasi_random, rotation, stretches, trace};
+use crate::kit::flow::{DAY, EVERYTHING, quasi_random, rotation, trace};
 use crate::kit::scene;
 use crate::sweep::{TOLERANCE, bisect, grid, in_square, lattice, map, row, traced};
 use ridgewatch::field::{Axis, Domain, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -101,7 +101,7 @@ fn coasts() {
     let ftle = |normalisation, distance: f64| {
         let map = FlowMap { boundary: Boundary::Stop, normalisation, ..map(TIME, 800, Precision::F64) };
         let out = trace(&source, &map, 0.0, &[DomainPoint([(30.0 - distance) as f32, 2.0, 0.5])], EVERYTHING);
-        (stretches(&out)[0] / TIME, f64::from(out.lifetime_share[0]))
+        (out.unrounded()[0] / TIME, f64::from(out.lifetime_share[0]))
     };
     // From the open sea towards the coast: where the FTLE is off by a tenth.
     let off = |normalisation| 20.0 / bisect(1.0, 200.0, |nearer| (ftle(normalisation, 20.0 / nearer).0 / inland - 1.0).abs() > 0.1);
@@ -137,7 +137,7 @@ fn open_boundaries() {
         let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / seeds.len() as f64;
         let lived = mean(&mut out.lifetime_share.iter().map(|&s| f64::from(s)));
         let left = mean(&mut out.lifetime_share.iter().map(|&s| f64::from(u8::from(s < 1.0))));
-        (mean(&mut stretches(&out).into_iter()) / tau, lived, left)
+        (mean(&mut out.unrounded().into_iter()) / tau, lived, left)
     };
     let biased = bisect(0.01, 10.0, |tau| out(tau).0 < 0.9);
     let warned = bisect(0.01, 10.0, |tau| out(tau).1 < 0.75);

@@ -1,6 +1,6 @@
 //! Sweeps, errors, and the rows that they print.
 
-use crate::kit::flow::{stretches, trace};
+use crate::kit::flow::trace;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{Extras, FlowMap, Integrator, Precision, VelocitySource};
@@ -48,7 +48,7 @@ pub fn lattice(domain: &Domain, [nx, ny]: [usize; 2]) -> Vec<DomainPoint> {
 
 /// Log-stretches of seeds.
 pub fn traced(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[DomainPoint]) -> Vec<f64> {
-    stretches(&trace(source, map, t0, seeds, Extras::default()))
+    trace(source, map, t0, seeds, Extras::default()).unrounded()
 }
 
 pub fn map(tau: f64, steps: usize, precision: Precision) -> FlowMap {

@@ -1,5 +1,7 @@
 //! The error that a picture states, from sums over tiles.
 
+use super::super::Film;
+use super::tone::squared_slope;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
@@ -166,6 +168,18 @@ impl PictureError {
             rays_per_pixel,
         }
     }
+}
+
+/// PSNR over lit pixels, in decibels, of the mean of two independent pictures, from their difference. `tone_map` is `[contrast, brightness, gamma]`.
+pub fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
+    let (mut sum, mut lit) = (0.0, 0.0);
+    for (a, b) in a.rgba.iter().zip(&b.rgba).filter(|(a, b)| a[3] + b[3] > 2.0 * LIT) {
+        lit += 1.0;
+        for (a, b) in a[..3].iter().zip(&b[..3]) {
+            sum += f64::from(squared_slope(tone_map, 0.5 * (a + b))) * f64::from(0.5 * (a - b)).powi(2) / 3.0;
+        }
+    }
+    -10.0 * (sum / lit).max(1e-12).log10()
 }
 
 #[cfg(test)]
