@@ -38,7 +38,8 @@ struct Job {
 /// How far a field is.
 #[derive(Serialize)]
 struct Underway {
-    slide: u64,
+    /// `null` while the run reads its next slide, whose field it will be.
+    slide: Option<u64>,
     /// Share of the seeds that are traced.
     share: f64,
     /// Seconds left as they have gone so far; `null` before the first seeds.
@@ -50,16 +51,16 @@ impl Fields {
         lock(&self.job)
     }
 
-    /// The job of a slide, which begins if there is none; without a number that of the newest slide.
+    /// The job of a slide, which begins if there is none; without a number that of the newest slide. `Ok(None)`: the run reads its next slide.
     ///
     /// # Errors
     /// The slide is not kept, or the field of another one is being traced.
-    fn of(self: &Arc<Self>, slide: Option<u64>, newest: &Arc<NewestFrame>) -> Result<Arc<Job>, Refusal> {
+    fn of(self: &Arc<Self>, slide: Option<u64>, newest: &Arc<NewestFrame>) -> Result<Option<Arc<Job>>, Refusal> {
         let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
-        let slide = slide.or_else(|| slides.index());
+        let shown = slides.index();
         let mut kept = self.lock();
         match &*kept {
-            Some(job) if Some(job.slide) == slide => return Ok(Arc::clone(job)),
+            Some(job) if Some(job.slide) == slide.or(shown) => return Ok(Some(Arc::clone(job))),
             Some(job) if lock(&job.made).is_none() => {
                 return Err((
                     StatusCode::SERVICE_UNAVAILABLE,
@@ -68,13 +69,15 @@ impl Fields {
             }
             _ => {}
         }
-        let field = slides.get(slide).map_err(no_field)?;
+        let Some(field) = slides.get(slide).map_err(no_field)? else {
+            return Ok(None);
+        };
         let now = Instant::now();
         let [done, all] = [0, 0].map(AtomicUsize::new);
         let job = Arc::new(Job { slide: field.index(), began: now, done, all, asked: Mutex::new(now), made: Mutex::default() });
         *kept = Some(Arc::clone(&job));
         tokio::spawn(Arc::clone(self).make(Arc::clone(&job), field, newest.run().to_owned()));
-        Ok(job)
+        Ok(Some(job))
     }
 
     async fn make(self: Arc<Self>, job: Arc<Job>, field: SlideField, run: String) {
@@ -109,7 +112,7 @@ impl Job {
         let [done, all] = [&self.done, &self.all].map(|count| count.load(Ordering::Relaxed) as f64);
         let share = if all > 0.0 { done / all } else { 0.0 };
         let left = self.began.elapsed().as_secs_f64() * (1.0 - share) / share;
-        Underway { slide: self.slide, share, seconds_left: Some(left).filter(|left| left.is_finite()) }
+        Underway { slide: Some(self.slide), share, seconds_left: Some(left).filter(|left| left.is_finite()) }
     }
 }
 
@@ -123,15 +126,15 @@ impl Pixels {
         let newest = self.newest.as_ref().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
         let accepted = "the number of a slide, or none for the newest";
         let slide = parameter(uri, "slide").map(|text| whole("slide", text, accepted)).transpose()?;
-        let job = self.fields.of(slide, newest)?;
+        let Some(job) = self.fields.of(slide, newest)? else {
+            return underway(&Underway { slide: None, share: 0.0, seconds_left: None });
+        };
         *lock(&job.asked) = Instant::now();
         // Without a place for it the file waits.
         let place = Arc::clone(&self.downloads).try_acquire_owned().ok();
         let made = place.and_then(|place| Some((lock(&job.made).clone()?, place)));
         let Some((made, place)) = made else {
-            let underway =
-                serde_json::to_string(&job.underway()).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))?;
-            return Ok((StatusCode::ACCEPTED, [(CONTENT_TYPE, "application/json")], underway).into_response());
+            return underway(&job.underway());
         };
         if made.is_err() {
             self.fields.lock().take_if(|kept| Arc::ptr_eq(kept, &job));
@@ -141,6 +144,11 @@ impl Pixels {
         let head = [(CONTENT_TYPE, "application/netcdf".to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))];
         Ok((head, Bytes::from_owner(Sent::new(bytes, place))).into_response())
     }
+}
+
+fn underway(how_far: &Underway) -> Result<Response, Refusal> {
+    let json = serde_json::to_string(how_far).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))?;
+    Ok((StatusCode::ACCEPTED, [(CONTENT_TYPE, "application/json")], json).into_response())
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

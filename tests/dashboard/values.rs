@@ -5,14 +5,15 @@ use crate::kit::publishing;
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, ask, get};
 use crate::{LIMIT, Stage};
-use ridgewatch::publish::{MapAbout, NewestFrame, channels_at, decode_exr, png, read_exr};
+use ridgewatch::publish::{MapAbout, NewestFrame, NewestSlide, NoField, channels_at, decode_exr, png, read_exr};
 use ridgewatch::render::{CameraSettings, Film};
-use ridgewatch::run::{ColorBar, DomainRecord, Frame, FrameRecord};
+use ridgewatch::run::{ColorBar, DomainRecord, Frame, FrameRecord, ShownSlide};
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// A film whose pixels all differ, with an error a pixel or without.
@@ -366,4 +367,32 @@ fn a_run_traces_the_field_of_its_slide() {
     for name in ["x", "y", "time", "time_bounds", "ftle", "lifetime", "ftle_error_of_steps", "integration_steps"] {
         assert_eq!(values(&own, name), values(&wanted, name), "{name}");
     }
+}
+
+/// A run beside a simulation has no window for most of the time: it has given up the last one and awaits the next.
+#[test]
+fn who_asks_between_two_slides_gets_the_next_one() {
+    let mut setup = scene::setup(&scene::gated_turbulence("source.snapshots = 12\ntime.tau = 4"), &["time.slides=5"]);
+    let newest = NewestSlide::new(&setup.plan);
+    let index = |wanted| newest.get(wanted).map(|slide| slide.map(|slide| slide.index()));
+    assert!(matches!(index(None), Err(NoField::Missing(_))));
+    let mut next = || {
+        let slide = setup.slides.next_slide(&AtomicBool::new(false)).unwrap().unwrap();
+        let shown = ShownSlide { slide, map: setup.plan.map.clone(), asked: setup.plan.map.clone(), is_new: true };
+        newest.put(&shown);
+        shown
+    };
+    let shown = next();
+    assert_eq!(index(Some(0)).unwrap(), Some(0));
+    drop(shown);
+    // Who wants this very slide is told; only who wants the newest one can be served later.
+    assert!(matches!(index(Some(0)), Err(NoField::Gone(why)) if why.contains("reads the next one")));
+    drop(next());
+    assert_eq!(index(None).unwrap(), None, "nobody had asked");
+    drop(next());
+    drop(next());
+    assert_eq!(index(None).unwrap(), Some(3));
+    assert!(matches!(index(Some(3)), Err(NoField::Gone(_))), "it was kept for the one who asked");
+    drop(next());
+    assert_eq!(index(None).unwrap(), None);
 }

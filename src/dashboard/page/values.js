@@ -130,8 +130,9 @@ export function fileName(run, { frame, slide }, ending) {
   return `${run}-frame-${String(frame).padStart(6, "0")}-slide-${String(slide).padStart(4, "0")}.${ending}`;
 }
 
-/** How far the field of a slide is. */
+/** How far the field of a slide is; without a slide the run reads its next one. */
 export function fieldWords({ slide, share, seconds_left: left }) {
+  if (slide === null) return "The run reads its next slide, whose FTLE is traced then.";
   return `Tracing the FTLE of slide ${count(slide)} beside the run: ${percent(share)}${left === null ? "" : `, about ${duration(left)} left`}.`;
 }
 

@@ -6,13 +6,16 @@ use crate::flow::{Extras, Traced, Tracer, VelocitySource, cpu_tracer};
 use crate::run::{Plan, ShownSlide, Slide};
 use crate::source::utc;
 use ridgewatch_base::memory::{available, gib};
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant};
 
 /// Most seeds of a field that is traced beside a run, in all and along an axis.
 const MOST_SEEDS: usize = 1 << 22;
 const MOST_ALONG: usize = 1 << 16;
 /// Seeds of a closed form.
 const CLOSED_FORM_SEEDS: f64 = 524_288.0;
+/// Time for which the windows of new slides are kept for who has asked between two slides.
+const ASKED_FOR: Duration = Duration::from_secs(15);
 /// Most seeds traced at once, after which progress is told.
 const AT_ONCE: usize = 1 << 14;
 
@@ -74,7 +77,14 @@ impl SeedField {
 #[derive(Debug)]
 pub struct NewestSlide {
     plan: Plan,
-    kept: Mutex<Option<Kept>>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    kept: Option<Kept>,
+    /// When somebody last asked between two slides.
+    asked: Option<Instant>,
 }
 
 #[derive(Debug)]
@@ -88,66 +98,80 @@ struct Kept {
 
 #[derive(Debug)]
 enum KeptVelocity {
-    Window(Weak<Window>),
-    Analytic(VelocitySource),
+    /// A window that the run gives up when it reads the next one.
+    Borrowed(Weak<Window>),
+    /// A closed form, or a window that is kept for who asked.
+    Owned(VelocitySource),
 }
 
 impl NewestSlide {
     /// Of a run that has none yet.
     pub fn new(plan: &Plan) -> Self {
-        Self { plan: plan.clone(), kept: Mutex::default() }
+        Self { plan: plan.clone(), state: Mutex::default() }
     }
 
-    /// Keeps this slide in place of the one before.
+    /// Keeps this slide in place of the one before, with its window if somebody has asked for one meanwhile.
     pub fn put(&self, shown: &ShownSlide) {
         let ShownSlide { slide, asked, .. } = shown;
-        let velocity = match &slide.velocity {
-            VelocitySource::Window(window) => KeptVelocity::Window(Arc::downgrade(window)),
-            closed @ VelocitySource::Analytic(..) => KeptVelocity::Analytic(closed.clone()),
-        };
         let plan = Plan { map: asked.clone(), ..self.plan.clone() };
-        *self.lock() = Some(Kept { index: slide.index, time: slide.time, date: slide.date.clone(), velocity, plan });
+        let mut state = self.lock();
+        let velocity = match &slide.velocity {
+            VelocitySource::Window(window) if state.asked.is_none_or(|asked| asked.elapsed() > ASKED_FOR) => {
+                KeptVelocity::Borrowed(Arc::downgrade(window))
+            }
+            velocity => KeptVelocity::Owned(velocity.clone()),
+        };
+        state.kept = Some(Kept { index: slide.index, time: slide.time, date: slide.date.clone(), velocity, plan });
     }
 
     /// Number of the slide that is kept.
     pub fn index(&self) -> Option<u64> {
-        self.lock().as_ref().map(|kept| kept.index)
+        self.lock().kept.as_ref().map(|kept| kept.index)
     }
 
-    /// The slide of this number, or the newest one, to be traced. Its window is kept as long as what is returned.
+    /// The slide of this number, or the newest one, to be traced. Its window is kept as long as what is returned. `Ok(None)`: the run reads its next
+    /// slide, which is kept for who asks again within 15 seconds.
     ///
     /// # Errors
     /// The run shows another slide or none, or there is no memory for a window beside those of the run.
-    pub fn get(&self, wanted: Option<u64>) -> Result<SlideField, NoField> {
-        let kept = self.lock();
-        let kept = kept.as_ref().ok_or_else(|| NoField::Missing("no frame is complete yet".to_owned()))?;
+    pub fn get(&self, wanted: Option<u64>) -> Result<Option<SlideField>, NoField> {
+        let mut state = self.lock();
+        let state = &mut *state;
+        let kept = state.kept.as_mut().ok_or_else(|| NoField::Missing("no frame is complete yet".to_owned()))?;
         let index = kept.index;
         if let Some(wanted) = wanted.filter(|wanted| *wanted != index) {
             return Err(NoField::Gone(format!("slide {wanted} is no longer kept: the run shows slide {index}")));
         }
         let velocity = match &kept.velocity {
-            KeptVelocity::Analytic(closed) => closed.clone(),
-            KeptVelocity::Window(window) => match window.upgrade() {
+            KeptVelocity::Owned(velocity) => velocity.clone(),
+            KeptVelocity::Borrowed(window) => match window.upgrade() {
                 Some(window) => VelocitySource::Window(window),
+                None if wanted.is_none() => {
+                    state.asked = Some(Instant::now());
+                    return Ok(None);
+                }
                 None => return Err(NoField::Gone(format!("slide {index} is no longer kept: the run reads the next one"))),
             },
         };
-        if let VelocitySource::Window(window) = &velocity
-            && let Some(free) = available()
-            && window.bytes() as u64 > free / 2
-        {
-            let (window, free) = (gib(window.bytes() as u64), gib(free));
-            let why = format!(
-                "its window may have to be kept beside those of the run: {window:.2} GiB, and {free:.2} GiB are free; accepted: half"
-            );
-            return Err(NoField::NoRoom(why));
+        state.asked = None;
+        if let VelocitySource::Window(window) = &velocity {
+            kept.velocity = KeptVelocity::Borrowed(Arc::downgrade(window));
+            if let Some(free) = available()
+                && window.bytes() as u64 > free / 2
+            {
+                let (window, free) = (gib(window.bytes() as u64), gib(free));
+                let why = format!(
+                    "its window may have to be kept beside those of the run: {window:.2} GiB, and {free:.2} GiB are free; accepted: half"
+                );
+                return Err(NoField::NoRoom(why));
+            }
         }
         let slide = Slide { index, time: kept.time, date: kept.date.clone(), live: None, velocity, warnings: Vec::new(), waited: 0.0 };
-        Ok(SlideField { plan: kept.plan.clone(), slide })
+        Ok(Some(SlideField { plan: kept.plan.clone(), slide }))
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Kept>> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

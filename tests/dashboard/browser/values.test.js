@@ -39,6 +39,7 @@ test("names of files tell run, frame and slide", () => {
 });
 
 test("how far a field is has its time left, once seeds are traced", () => {
+  assert.equal(fieldWords({ slide: null, share: 0, seconds_left: null }), "The run reads its next slide, whose FTLE is traced then.");
   assert.equal(fieldWords({ slide: 1234, share: 0, seconds_left: null }), "Tracing the FTLE of slide 1,234 beside the run: 0 %.");
   assert.equal(fieldWords({ slide: 3, share: 0.25, seconds_left: 9 }), "Tracing the FTLE of slide 3 beside the run: 25 %, about 9.0 s left.");
 });
