@@ -167,7 +167,7 @@ fn main() {
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
     let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
-    let device = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
+    let device = CudaDevice { gpu: gpu.clone(), storage: Some(Storage::F32), when_lost: WhenLost::Stop, may_fall_back: false };
     let device = Device::Cuda(device);
     let text = include_str!("../configs/turbulence_easy.toml");
     let mut keys = ["flow.steps=22", "surrogate.kind=residual"].map(str::to_owned).to_vec();

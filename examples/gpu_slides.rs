@@ -130,7 +130,7 @@ fn main() {
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
     // A measurement must not fall back to the CPU.
-    let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
+    let chosen = CudaDevice { gpu: gpu.clone(), storage: Some(Storage::F32), when_lost: WhenLost::Stop, may_fall_back: false };
     let mut memory = Vec::new();
     for (what, ahead, slides, frames_per_slide) in
         [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)]

@@ -7,14 +7,14 @@ mod kit;
 
 use kit::scene;
 use ridgewatch::backend::{
-    AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, HostPicture, Rendered, Surrogate,
-    SurrogateRequest, WhenLost, audit, render_on_cpu,
+    AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, HostPicture, Rendered, Storage,
+    Surrogate, SurrogateRequest, WhenLost, audit, render_on_cpu,
 };
 use ridgewatch::config::SceneFile;
-use ridgewatch::field::{DomainPoint, UnitPoint};
+use ridgewatch::field::{DomainPoint, Snapshot, UnitPoint, Window};
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::Renderer;
-use ridgewatch::run::{Event, FrameRecord, RunError, RunOptions, Setup, StageSeconds, run_on};
+use ridgewatch::run::{Decision, Event, FrameRecord, RunError, RunOptions, Setup, StageSeconds, run_on};
 use ridgewatch::source::Listener;
 use ridgewatch::surrogate::network::{Architecture, Objective, PlannedStep};
 use ridgewatch::surrogate::{
@@ -98,11 +98,40 @@ struct Breaking {
     may_fall_back: bool,
     /// Shortages that can be planned around.
     plans: usize,
+    /// How windows are held, if that is left to the run.
+    half: Option<Half>,
+}
+
+/// Half precision has so many bits of velocities in a window that begins at a time.
+struct Half {
+    storage: Storage,
+    bits: fn(f64) -> i32,
+}
+
+impl Half {
+    fn of(bits: fn(f64) -> i32) -> Option<Self> {
+        Some(Self { storage: Storage::F32, bits })
+    }
+
+    fn rounded(&self, velocity: &VelocitySource, t0: f64) -> VelocitySource {
+        let VelocitySource::Window(window) = velocity else { panic!("a window") };
+        let bits = (self.bits)(t0);
+        let round = |x: f32| {
+            let step = (x.abs().max(1e-20).log2().floor() + 1.0 - bits as f32).exp2();
+            (x / step).round() * step
+        };
+        let mut rounded = Window::new(window.span());
+        for snapshot in window.snapshots() {
+            let nodes = snapshot.nodes.iter().map(|node| node.map(round)).collect();
+            rounded.push(Arc::new(Snapshot::new(snapshot.time, snapshot.grid.clone(), nodes))).unwrap();
+        }
+        VelocitySource::Window(Arc::new(rounded))
+    }
 }
 
 impl Breaking {
     fn on(line: &Arc<Line>) -> Self {
-        Self { line: line.clone(), when_lost: WhenLost::Cpu, may_fall_back: false, plans: 2 }
+        Self { line: line.clone(), when_lost: WhenLost::Cpu, may_fall_back: false, plans: 2, half: None }
     }
 }
 
@@ -355,7 +384,12 @@ impl Backend for Breaking {
     fn prefetch(&self) -> Option<Listener> {
         None
     }
+    fn open_storage(&mut self) -> Option<&mut Storage> {
+        self.half.as_mut().map(|half| &mut half.storage)
+    }
     fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<BreakingTracer, BackendError> {
+        let held = self.half.as_ref().filter(|half| half.storage != Storage::F32).map(|half| half.rounded(velocity, t0));
+        let velocity = held.as_ref().unwrap_or(velocity);
         let tracer = BreakingTracer { line: self.line.clone(), host: cpu_tracer(velocity.clone(), map, t0)? };
         self.line.call("uploading a window")?;
         Ok(tracer)
@@ -416,6 +450,7 @@ struct Made {
     films: Vec<Vec<u32>>,
     error: Option<RunError>,
     warnings: Vec<String>,
+    decisions: Vec<Decision>,
 }
 
 impl Made {
@@ -443,7 +478,7 @@ fn made_on<B: Backend>(backend: B, scene: &SceneFile, options: &RunOptions, afte
     };
     let options = RunOptions { threads: 2, ..options.clone() };
     match run_on(backend, Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)) {
-        Ok(report) => made.warnings = report.warnings,
+        Ok(report) => (made.warnings, made.decisions) = (report.warnings, report.decisions),
         Err(error) => made.error = Some(error),
     }
     made
@@ -752,5 +787,53 @@ fn checkpoints_while_a_device_trains() {
         resumed.training.resume = Some(path.clone());
         let goes_on = made(ridgewatch::backend::Cpu, &resumed);
         assert!(goes_on.error.is_none(), "{kind}: the last one is whole: {:?}", goes_on.error);
+    }
+}
+
+/// A window is held in half precision as long as the picture does not show it.
+#[test]
+fn half_precision_is_given_up_where_the_picture_shows_it() {
+    let keys = "
+        source.nodes = [24, 12, 12]
+        source.snapshots = 8
+        time.tau = 4
+        time.frames_per_slide = 1
+        transfer.low = 0.1
+        transfer.high = 0.4
+        render.method = \"two_level\"
+        surrogate.kind = \"table\"
+    ";
+    let scene = scene::parse(&scene::scene("turbulence", [24, 12, 4], keys), &[]).unwrap();
+    let whole = Line::new(usize::MAX, How::Fault);
+    let on = |line: &Arc<Line>, bits: fn(f64) -> i32| made(Breaking { half: Half::of(bits), ..Breaking::on(line) }, &scene);
+    let decision = |made: &Made| made.decisions.iter().find(|d| d.setting == "device.storage").map(|d| (d.chosen.clone(), d.why.clone()));
+    let single = made(ridgewatch::backend::Cpu, &scene);
+    assert_eq!(decision(&single), None, "a processor has one form");
+
+    let (half, coarse) = (on(&whole, |_| 11), on(&whole, |_| 1));
+    let (chosen, why) = decision(&half).unwrap();
+    println!("{why}");
+    assert!(chosen == "f16_pairs" && why.contains("colours differ by 0.0"), "{why}");
+    assert!(half.films != single.films, "it was held so");
+    let (chosen, why) = decision(&coarse).unwrap();
+    println!("{why}");
+    assert!(chosen == "f32" && why.contains("with f16_pairs colours differ by") && why.contains("allowed: 0.02"), "{why}");
+    assert!(coarse.films == single.films, "nothing is left of it");
+
+    // Later slides are looked at as well.
+    let later = on(&whole, |t0| if t0 < 2.5 { 11 } else { 1 });
+    let (chosen, _) = decision(&later).unwrap();
+    assert!(chosen == "f32" && later.films[..3] == half.films[..3] && later.films[3..] != half.films[3..], "{chosen}");
+
+    // Where steps are given, nothing is compared.
+    let given = scene::parse(&scene::scene("turbulence", [24, 12, 4], keys), &["flow.steps=8"]).unwrap();
+    let given = made(Breaking { half: Half::of(|_| 3), ..Breaking::on(&whole) }, &given);
+    assert_eq!(decision(&given), None);
+
+    let calls = whole.calls.lock().unwrap().len();
+    for breaks_at in points(6, calls / 4) {
+        let line = Line::new(breaks_at, How::Fault);
+        let lost = on(&line, |_| 11);
+        assert!(lost.error.is_none() && lost.films.len() == single.films.len(), "{breaks_at}: {:?}", lost.error);
     }
 }

@@ -33,8 +33,8 @@ pub enum Device {
 pub struct CudaDevice {
     /// The GPU.
     pub gpu: Arc<Gpu>,
-    /// Storage format of the velocity window.
-    pub storage: Storage,
+    /// Storage format of the velocity window; `None`: chosen by the run, and f32 for work that is no run.
+    pub storage: Option<Storage>,
     /// Reaction to a lost device.
     pub when_lost: WhenLost,
     /// True if the CPU takes over when the first slide does not fit the device. This is so if the device was selected by `auto`.
@@ -103,7 +103,7 @@ impl Device {
             Self::Cpu { .. } => {}
             #[cfg(feature = "cuda")]
             Self::Cuda(CudaDevice { gpu, storage, .. }) => {
-                let tuning = Tuning { storage: *storage, ..Tuning::default() };
+                let tuning = Tuning { storage: storage.unwrap_or_default(), ..Tuning::default() };
                 match CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning) {
                     Ok(tracer) => return Ok((Box::new(tracer), None)),
                     Err(BackendError::Device(error)) if self.may_fall_back(&error) => note = Some(format!("traced on the CPU: {error}")),
@@ -150,7 +150,7 @@ impl Device {
             Self::Cpu { .. } => {}
             #[cfg(feature = "cuda")]
             Self::Cuda(CudaDevice { gpu, storage, .. }) => {
-                let tuning = Tuning { storage: *storage, ..Tuning::default() };
+                let tuning = Tuning { storage: storage.unwrap_or_default(), ..Tuning::default() };
                 let tracer = CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning);
                 begun = Instant::now();
                 let mut trace = |tracer: &CudaTracer| Interruptible::new(tracer, stop).trace(seeds, Extras::default(), &mut traced);

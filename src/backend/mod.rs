@@ -58,6 +58,11 @@ pub trait Backend: Send + Sync + Sized {
     /// Returns a listener that is called with each snapshot that is read, to upload it before the window needs it. `None` on the CPU.
     fn prefetch(&self) -> Option<Listener>;
 
+    /// Form in which later windows are held, if the settings leave it to the run. `None`: they do not, or the backend has no forms (CPU).
+    fn open_storage(&mut self) -> Option<&mut Storage> {
+        None
+    }
+
     /// Uploads the velocity of a slide and prepares its flow map for seeds at the start time `t0`.
     ///
     /// # Errors

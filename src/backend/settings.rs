@@ -101,8 +101,9 @@ pub enum WhenLost {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DeviceSettings {
-    /// Storage format of the velocity window.
-    pub storage: Storage,
+    /// Storage format of the velocity window. `None`: [`Storage::F16Pairs`] if a smooth picture with open steps does not tell it from
+    /// [`Storage::F32`], which everything else takes.
+    pub storage: Option<Storage>,
     /// Limit on device memory, MiB. `None`: 90 % of the memory that is free at start.
     pub memory_mib: Option<u64>,
     /// Reaction to a lost device. A lost device is not used again in this run. Running out of memory does not lose the device: the CPU then does the

@@ -351,11 +351,11 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
         }
         #[cfg(feature = "cuda")]
         Device::Cuda(device) => {
-            let mut backend = Cuda::new(&CudaDevice { storage: Storage::F32, ..device.clone() });
+            let mut backend = Cuda::new(&CudaDevice { storage: Some(Storage::F32), ..device.clone() });
             tracing(&mut bench, &mut backend, steps, "")?;
             // A closed form has no snapshots to store.
             if opened.window_bytes > 0 {
-                let mut half = Cuda::new(&CudaDevice { storage: Storage::F16, ..device.clone() });
+                let mut half = Cuda::new(&CudaDevice { storage: Some(Storage::F16), ..device.clone() });
                 bench.window_bytes = opened.window_bytes / Storage::F32.bytes() * Storage::F16.bytes();
                 tracing(&mut bench, &mut half, steps, ", f16 storage")?;
                 bench.window_bytes = opened.window_bytes;

@@ -63,7 +63,7 @@ impl<B: Backend> Cycle<'_, B> {
         let report = &mut self.run.report;
         (report.integration_difference, report.integration_residual) = (None, None);
         report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));
-        Decision::withdraw(&mut report.decisions, &["flow.steps"]);
+        Decision::withdraw(&mut report.decisions, &["flow.steps", "device.storage"]);
         if self.map.tau != former_tau {
             Decision::withdraw(&mut report.decisions, &["time.tau"]);
         }

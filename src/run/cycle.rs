@@ -14,8 +14,9 @@ use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{LOOK_UP, Slide, Slides};
 use super::steering::{Command, Steering, drawn_by};
-use super::steps::{PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
+use super::steps::{Comparison, PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
 use super::stop::{RunEnd, check_stop};
+use super::storage::begin_with_half;
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
 use super::{ColorBar, RunError, Settings, TransferRecord};
@@ -280,6 +281,8 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) frames_before: usize,
     /// Choice of the steps for the log-stretch, and the steps of the picture, if the picture decides on them.
     pub(super) settled: Option<(StepChoice, PictureSteps)>,
+    /// Points on which they were compared last, until the storage of the window is judged by them.
+    pub(super) compared: Option<Comparison>,
 }
 
 /// Place of a frame in its slide.
@@ -327,7 +330,7 @@ pub fn run_on<B: Backend>(
 }
 
 fn drive<B: Backend>(
-    backend: B,
+    mut backend: B,
     setup: Setup,
     options: &RunOptions,
     sink: &mut Sink<'_>,
@@ -350,6 +353,7 @@ fn drive<B: Backend>(
     let mut slide = first.ok_or(RunError::EndedEarly)?;
     let begun = Instant::now();
     let mut beginning = Beginning { threads: &threads, stop, warnings: Vec::new() };
+    begin_with_half(&mut backend, &plan, &slide);
     let mut session = begin(backend, &plan, &slide, &mut beginning)?;
     check_stop(stop)?;
     // A flow map that is made again, after a failure, has its steps given.
@@ -372,7 +376,7 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, earlier_race, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
-    let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None };
+    let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None, compared: None };
     if let Some(chosen) = chosen {
         cycle.take_steps(chosen, None);
     }
@@ -537,17 +541,20 @@ impl<'a> Run<'a> {
 }
 
 impl<B: Backend> Cycle<'_, B> {
-    /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer.
+    /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer, and by one of a window in single precision,
+    /// if the picture needs it.
     pub(super) fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
         let shown = self.run.shown();
         let Some(chosen) = chosen.filter(|_| suit_the_picture(shown.plan)) else { return Ok(()) };
-        let settled = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
+        let (settled, compared) = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
+        self.compared = compared;
         self.settled = Some((chosen, settled));
         if settled.steps < chosen.steps {
             tracing::info!("{settled:?} instead of {chosen:?}");
             self.take_steps(chosen, Some(settled));
             transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         }
+        self.settle_storage(slide)?;
         Ok(())
     }
 
@@ -555,20 +562,23 @@ impl<B: Backend> Cycle<'_, B> {
     pub(super) fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
         let Some((chosen, settled)) = self.settled else { return Ok(false) };
         let (shown, begin) = (self.run.shown(), Instant::now());
-        let anew = self.run.threads.render().install(|| {
-            if !is_outdated(shown, slide, chosen, settled)? {
-                return Ok(None);
+        let (anew, compared) = self.run.threads.render().install(|| {
+            let (is_outdated, compared) = is_outdated(shown, slide, chosen, settled)?;
+            if !is_outdated {
+                return Ok((None, compared));
             }
             match cpu_tracer(slide.velocity.clone(), shown.map, slide.time) {
                 Ok(tracer) => {
                     let anew = tracer.step_choice().unwrap_or(chosen);
-                    Ok(Some(Ok((anew, picture_steps(shown, slide, anew)?))))
+                    let (settled, compared) = picture_steps(shown, slide, anew)?;
+                    Ok((Some(Ok((anew, settled))), compared))
                 }
                 // The run goes on with what it has.
-                Err(error @ FlowError::StepsNotFound { .. }) => Ok(Some(Err(error))),
+                Err(error @ FlowError::StepsNotFound { .. }) => Ok((Some(Err(error)), compared)),
                 Err(error) => Err(RunEnd::from(error)),
             }
         })?;
+        self.compared = compared;
         tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
         let (chosen, settled) = match anew {
             None => return Ok(false),
@@ -677,6 +687,7 @@ impl<B: Backend> Cycle<'_, B> {
     /// Makes the flow map of a slide, and all that was traced by the one before.
     pub(super) fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        self.settle_storage(slide)?;
         self.run.learning.peak = f32::NEG_INFINITY;
         self.run.progress.lacks_room_for_nodes = false;
         let rebuilds = self.run.learning.resize.is_some();
@@ -718,7 +729,7 @@ impl<B: Backend> Cycle<'_, B> {
             let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
             if commands == Commands::Map {
                 self.take_map(slides, slide)?;
-            } else if commands == Commands::Colours && self.look_at_steps(slide)? {
+            } else if commands == Commands::Colours && (self.look_at_steps(slide)? || self.settle_storage(slide)?) {
                 with!(&mut self.session, on => {
                     on.tracer = None;
                     on.picture = Default::default();
@@ -854,7 +865,7 @@ impl<B: Backend> Cycle<'_, B> {
 }
 
 impl Run<'_> {
-    fn shown(&self) -> Shown<'_> {
+    pub(super) fn shown(&self) -> Shown<'_> {
         Shown {
             plan: self.plan,
             map: &self.asked,

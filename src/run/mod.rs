@@ -25,6 +25,7 @@ mod slides;
 mod steering;
 mod steps;
 mod stop;
+mod storage;
 mod training;
 mod transaction;
 

@@ -39,8 +39,18 @@ pub(super) struct Shown<'a> {
 
 impl Shown<'_> {
     /// The largest optical residual of the steps.
-    fn most(&self) -> f64 {
+    pub(super) fn most(&self) -> f64 {
         self.tolerance * if self.plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
+    }
+
+    /// In double precision, as the steps of the log-stretch are chosen.
+    fn tracer(&self, slide: &Slide, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
+        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.map.clone() };
+        cpu_tracer(slide.velocity.clone(), &map, slide.time)
+    }
+
+    fn ramp(&self, log_stretch: f32) -> f64 {
+        f64::from(self.transfer.ramp(log_stretch / self.map.tau as f32))
     }
 }
 
@@ -56,41 +66,46 @@ pub(super) struct PictureSteps {
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
 /// [`SHARE`] or [`FLAT_SHARE`] of the tolerance, or those `chosen` for the log-stretch if it has none below them, if these are not within their own
-/// tolerance, or if too few points show anything to judge by.
+/// tolerance, or if too few points show anything to judge by (and there is no comparison).
 ///
 /// # Errors
 /// As for [`cpu_tracer`], or a stop is requested.
-pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<PictureSteps, RunEnd> {
+pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<(PictureSteps, Option<Comparison>), RunEnd> {
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
     let Some(comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
-        return Ok(PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 });
+        return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 }, None));
     };
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
-        let found = comparison.of(multiple * chosen.multiple_of)?;
+        let found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
         if found.residual <= shown.most() {
-            return Ok(found);
+            return Ok((found, Some(comparison)));
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
     }
-    comparison.of(chosen.steps)
+    Ok((comparison.of(shown, slide, chosen.steps)?, Some(comparison)))
 }
 
 /// Whether steps that were `settled` for an earlier slide suit the picture of this one no more: its flow, its colours or its tolerance may be others.
-/// `chosen` was the choice for the log-stretch.
+/// `chosen` was the choice for the log-stretch. No comparison: too few points show anything to judge by.
 ///
 /// # Errors
 /// As for [`picture_steps`].
-pub(super) fn is_outdated(shown: Shown<'_>, slide: &Slide, chosen: StepChoice, settled: PictureSteps) -> Result<bool, RunEnd> {
+pub(super) fn is_outdated(
+    shown: Shown<'_>,
+    slide: &Slide,
+    chosen: StepChoice,
+    settled: PictureSteps,
+) -> Result<(bool, Option<Comparison>), RunEnd> {
     // A quarter of the points of a choice, and others on each slide.
     let cells = if shown.plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
-    let Some(comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok(false) };
+    let Some(comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok((false, None)) };
     // Where the choice had no more steps to give, their residual may be larger.
     let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };
-    let share = comparison.of(settled.steps)?.residual / most;
+    let share = comparison.of(shown, slide, settled.steps)?.residual / most;
     // Outside its tolerance a choice has no fewer steps to give either.
     let is_least = settled.steps <= chosen.multiple_of || !chosen.within_tolerance;
-    Ok(share > *AGAIN.end() || share < *AGAIN.start() && !is_least)
+    Ok((share > *AGAIN.end() || share < *AGAIN.start() && !is_least, Some(comparison)))
 }
 
 /// Whether the scene leaves the number of steps to the picture.
@@ -99,53 +114,46 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
     scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth()
 }
 
-/// Points of a slide, and their log-stretch with many steps.
-struct Comparison<'a> {
-    shown: Shown<'a>,
-    slide: &'a Slide,
-    points: Vec<DomainPoint>,
+/// Points of a slide, and their log-stretch with many steps in double precision.
+pub(super) struct Comparison {
+    pub(super) points: Vec<DomainPoint>,
     truth: Traced,
 }
 
-impl<'a> Comparison<'a> {
+impl Comparison {
     /// One point in each of the `cells` of the domain. `None` if too few of them show anything.
-    fn new(shown: Shown<'a>, slide: &'a Slide, cells: [usize; 3], number: u64, steps: usize) -> Result<Option<Self>, RunEnd> {
+    fn new(shown: Shown<'_>, slide: &Slide, cells: [usize; 3], number: u64, steps: usize) -> Result<Option<Self>, RunEnd> {
         // Not the seed of the picture, which would change the flow map.
         let unit = stratified_points(&Strata::even(cells, 1), number, STREAM);
-        let points = unit.into_iter().map(|unit| shown.plan.domain.from_unit(unit)).collect();
-        let mut comparison = Self { shown, slide, points, truth: Traced::default() };
-        let reference = comparison.tracer(steps)?;
-        comparison.points.retain(|&point| !reference.is_missing(point));
-        reference.trace(&comparison.points, Extras::default(), &mut comparison.truth);
-        let seen = comparison.truth.log_stretch.iter().filter(|&&s| comparison.ramp(s) > 0.0).count();
+        let mut points: Vec<DomainPoint> = unit.into_iter().map(|unit| shown.plan.domain.from_unit(unit)).collect();
+        let reference = shown.tracer(slide, steps)?;
+        points.retain(|&point| !reference.is_missing(point));
+        let mut truth = Traced::default();
+        reference.trace(&points, Extras::default(), &mut truth);
+        let seen = truth.log_stretch.iter().filter(|&&s| shown.ramp(s) > 0.0).count();
         let cells: usize = cells.iter().product();
-        Ok(Some(comparison).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
+        Ok(Some(Self { points, truth }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
     }
 
-    /// In double precision, as the steps of the log-stretch are chosen.
-    fn tracer(&self, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
-        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.shown.map.clone() };
-        cpu_tracer(self.slide.velocity.clone(), &map, self.slide.time)
-    }
-
-    fn ramp(&self, log_stretch: f32) -> f64 {
-        f64::from(self.shown.transfer.ramp(log_stretch / self.shown.map.tau as f32))
-    }
-
-    fn of(&self, steps: usize) -> Result<PictureSteps, RunEnd> {
-        check_stop(self.shown.stop)?;
+    fn of(&self, shown: Shown<'_>, slide: &Slide, steps: usize) -> Result<PictureSteps, RunEnd> {
+        check_stop(shown.stop)?;
         progress::mark();
         let mut traced = Traced::default();
-        self.tracer(steps)?.trace(&self.points, Extras::default(), &mut traced);
-        let pairs = || traced.log_stretch.iter().copied().zip(self.truth.log_stretch.iter().copied());
-        let residual = upper_rms(pairs().map(|(a, b)| match (a.is_finite(), b.is_finite()) {
-            (true, true) => self.ramp(a) - self.ramp(b),
+        shown.tracer(slide, steps)?.trace(&self.points, Extras::default(), &mut traced);
+        let pairs = traced.log_stretch.iter().zip(&self.truth.log_stretch);
+        let difference = upper_rms(pairs.map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
+        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced) })
+    }
+
+    /// Optical residual of what was traced at the points.
+    pub(super) fn residual(&self, shown: Shown<'_>, traced: &Traced) -> f64 {
+        let pairs = traced.log_stretch.iter().copied().zip(self.truth.log_stretch.iter().copied());
+        upper_rms(pairs.map(|(a, b)| match (a.is_finite(), b.is_finite()) {
+            (true, true) => shown.ramp(a) - shown.ramp(b),
             (false, false) => 0.0,
             // The colours may differ as much as they can.
             _ => 1.0,
-        }));
-        let difference = upper_rms(pairs().map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
-        Ok(PictureSteps { steps, difference, residual })
+        }))
     }
 }
 

@@ -34,7 +34,7 @@ pub fn device(settings: GpuSettings) -> Device {
 
 /// A device for whole runs that may lose it.
 pub fn device_when_lost(settings: GpuSettings, when_lost: WhenLost) -> Device {
-    Device::Cuda(CudaDevice { gpu: opened(settings), storage: Storage::F32, when_lost, may_fall_back: false })
+    Device::Cuda(CudaDevice { gpu: opened(settings), storage: Some(Storage::F32), when_lost, may_fall_back: false })
 }
 
 /// A surrogate whose table and network are on the device.

@@ -1,10 +1,13 @@
 //! Snapshots on the device.
 
 use super::scenes::*;
+use crate::kit::scene;
 use ridgewatch::backend::BackendError;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceError, GpuSettings, SnapshotStore, Storage, Tuning};
+use ridgewatch::backend::{CudaDevice, Device, WhenLost};
 use ridgewatch::field::{DomainPoint, Window};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Steps, Traced, VelocitySource};
+use ridgewatch::run::{RunOptions, RunReport};
 use ridgewatch::surrogate::Trace;
 use std::sync::Arc;
 
@@ -282,5 +285,46 @@ fn a_snapshot_that_others_hold_is_let_go_all_the_same() {
     while made[..8].iter().any(|snapshot| Arc::strong_count(snapshot) > 1) {
         assert!(began.elapsed().as_secs() < 5, "still held");
         std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}
+
+/// Left to the run, windows are held in half precision, and pictures do not show it.
+#[test]
+#[ignore = "needs a GPU"]
+fn smooth_pictures_do_not_show_half_precision() {
+    let keys = "
+        source.nodes = [96, 48, 48]
+        source.snapshots = 14
+        time.tau = 8
+        time.frames_per_slide = 1
+        transfer.low = 0.1
+        transfer.high = 0.4
+        render.method = \"two_level\"
+        surrogate.kind = \"table\"
+    ";
+    let text = scene::scene("turbulence", [192, 96, 4], keys);
+    let gpu = opened(GpuSettings::default());
+    let run = |storage| {
+        let device = Device::Cuda(CudaDevice { gpu: gpu.clone(), storage, when_lost: WhenLost::Stop, may_fall_back: false });
+        let mut frames = Vec::new();
+        let report =
+            scene::run_frames(scene::setup(&text, &[]), &RunOptions { device, ..RunOptions::default() }, |frame| frames.push(frame));
+        (report, frames)
+    };
+    let decision =
+        |report: &RunReport| report.decisions.iter().find(|d| d.setting == "device.storage").map(|d| (d.chosen.clone(), d.why.clone()));
+    let ((single, before), (open, after)) = (run(Some(Storage::F32)), run(None));
+    assert_eq!(decision(&single), None);
+    let (chosen, why) = decision(&open).unwrap();
+    println!("{chosen}: {why}");
+    assert_eq!(chosen, "f16_pairs");
+    assert!(before.len() == after.len() && before.len() > 3);
+    for (before, after) in before.iter().zip(&after) {
+        let squares =
+            before.film.rgba.iter().zip(&after.film.rgba).map(|(a, b)| (0..3).map(|k| f64::from(a[k] - b[k]).powi(2)).sum::<f64>() / 3.0);
+        let rms = (squares.sum::<f64>() / before.film.rgba.len() as f64).sqrt();
+        let stated = before.record.picture_error.unwrap().rms.value;
+        println!("slide {}: films differ by {rms:.2e} rms, stated error {stated:.2e}", before.record.slide);
+        assert!(rms > 0.0 && rms < 0.7 * stated, "as many samples, of the same random numbers: {rms} of {stated}");
     }
 }

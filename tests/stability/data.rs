@@ -310,7 +310,7 @@ fn half_precision_storage() {
         "velocities in f16",
         &format!("largest velocity below {slow:.0e} (degrees a second, say) or above {fast:.0}"),
         "none",
-        "`device.storage = \"f16\"` divides a window by a power of two; the default is f32",
+        "`device.storage = \"f16\"` divides a window by a power of two; by default half precision is taken where a smooth picture does not tell it",
         &format!("{normal:.0e} of the log-stretch by rounding, in every unit"),
         "half_precision_storage",
     ]);

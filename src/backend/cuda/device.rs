@@ -8,7 +8,7 @@ use super::window::SnapshotStore;
 use crate::cpu::{HostFrame, HostPicture, render_on_cpu};
 use crate::{
     AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
-    Rendered, StartsAnew, Surrogate, SurrogateRequest, WhenLost, audit,
+    Rendered, StartsAnew, Storage, Surrogate, SurrogateRequest, WhenLost, audit,
 };
 use ridgewatch_field::UnitPoint;
 use ridgewatch_flow::{FlowMap, VelocitySource};
@@ -54,6 +54,8 @@ impl Default for CudaPicture {
 /// A GPU as a backend, with the snapshots in its memory.
 pub struct Cuda {
     device: CudaDevice,
+    /// Form in which windows are held.
+    storage: Storage,
     gpu: Arc<Gpu>,
     snapshots: Arc<SnapshotStore>,
     placement: Placement,
@@ -67,7 +69,8 @@ impl Cuda {
     pub fn new(device: &CudaDevice) -> Self {
         let (gpu, device) = (device.gpu.clone(), device.clone());
         let snapshots = Arc::new(SnapshotStore::new(&gpu));
-        Self { device, gpu, snapshots, placement: Placement::DEVICE, frames: None, warnings: Vec::new() }
+        let storage = device.storage.unwrap_or_default();
+        Self { device, storage, gpu, snapshots, placement: Placement::DEVICE, frames: None, warnings: Vec::new() }
     }
 
     /// Returns the snapshots on the device.
@@ -140,8 +143,12 @@ impl Backend for Cuda {
         }))
     }
 
+    fn open_storage(&mut self) -> Option<&mut Storage> {
+        self.device.storage.is_none().then_some(&mut self.storage)
+    }
+
     fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<CudaTracer, BackendError> {
-        let tuning = Tuning { storage: self.device.storage, ..Tuning::default() };
+        let tuning = Tuning { storage: self.storage, ..Tuning::default() };
         CudaTracer::new(&self.snapshots, &self.gpu, velocity.clone(), map, t0, tuning)
     }
 
