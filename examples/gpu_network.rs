@@ -1,6 +1,6 @@
 //! Measures the network on a GPU: rates of prediction and training, and its accuracy after some seconds of tracing and training from
 //! a new network. Prints blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
-//! [published-speed] [published] [published-double-gyre] [published-globe] [published-flame] [seconds]`
+//! [abc] [published-speed] [published] [published-double-gyre] [published-globe] [published-flame] [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and stay there. The
 //! time includes building the network, tracing (also of the labels that determine the scale) and training; it excludes the upload of the window,
@@ -33,6 +33,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     if asked("double-gyre") {
         bench::double_gyre(seconds)?;
+    }
+    if asked("abc") {
+        bench::abc(seconds)?;
     }
     if asked("published-speed") {
         bench::published_speed()?;
@@ -573,7 +576,15 @@ mod bench {
             [("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)), ("hash 4x4, growth 1.6, base 128, T = 2^24, 2x64", finest())];
         let networks = published_settings().map(|(name, settings)| (name, settings, PUBLISHED));
         for (name, settings, pace) in networks.chain(hashes.map(|(name, settings)| (name.to_owned(), settings, HASH))) {
-            let lesson = Lesson { gpu: &gpu, domain, labels: &traced_by(tracer.device()), parts: 1, base: None, seconds };
+            let lesson = Lesson {
+                gpu: &gpu,
+                domain,
+                labels: &traced_by(tracer.device()),
+                axes: &[0, 1, 2][..domain.dimensions],
+                parts: 1,
+                base: None,
+                seconds,
+            };
             let (learned, network) = lesson.learn(&settings, pace, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
             rows.push(Row {
                 name,
@@ -657,7 +668,15 @@ mod bench {
         for (kind, base, networks) in [("alone", None, alone), ("above the first table", Some(&table), above)] {
             for (name, settings) in networks {
                 let base = base.map(|table| (table, traced));
-                let lesson = Lesson { gpu: &gpu, domain: &domain, labels: &traced_by(tracer.device()), parts: 1, base, seconds };
+                let lesson = Lesson {
+                    gpu: &gpu,
+                    domain: &domain,
+                    labels: &traced_by(tracer.device()),
+                    axes: &[0, 1, 2][..domain.dimensions],
+                    parts: 1,
+                    base,
+                    seconds,
+                };
                 let (learned, _) = lesson.learn(&settings, HASH, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
                 println!("| {kind} | {name} | {:.0} {}", learned.megabytes, learned.row());
             }
@@ -720,7 +739,8 @@ mod bench {
         println!("|---|---|---|---|---|---|---|---|");
         let of_start = |settings| NetworkSettings { inputs: vec![Input::Start], start_range: Some(STARTS), ..settings };
         let learned = |name: &str, settings: &NetworkSettings, pace: Pace| -> Outcome<()> {
-            let lesson = Lesson { gpu: &gpu, domain: &space_time, labels: &traced_by(&tracer), parts: 1, base: None, seconds };
+            let lesson =
+                Lesson { gpu: &gpu, domain: &space_time, labels: &traced_by(&tracer), axes: &[0, 1], parts: 1, base: None, seconds };
             let (learned, _) = lesson.learn(settings, pace, |network| Ok(psnr(&tested.predict(&network)?, &truth)))?;
             println!("| {name} | {:.0} {}", learned.megabytes, learned.row());
             Ok(())
@@ -798,15 +818,15 @@ mod bench {
 
         println!("| network over x, y, start and duration | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
         println!("|---|---|---|---|---|---|---|---|");
-        let labels = |batch: &Batch, number: u64| -> Outcome<Option<f32>> {
+        let labels = |batch: &Batch, number: u64| -> Outcome<Option<[f32; 2]>> {
             let duration = drawn((number % PARTS as u64) as usize, PARTS, number + 1);
             let tracer = tracer(duration, LABELS, Precision::F32)?;
             batch.trace(&tracer)?;
             // The tracer's memory is freed here.
             gpu.synchronize()?;
-            Ok(Some((duration / LONGEST) as f32))
+            Ok(Some([f32::NAN, (duration / LONGEST) as f32]))
         };
-        let lesson = Lesson { gpu, domain: space_time, labels: &labels, parts: PARTS, base: None, seconds };
+        let lesson = Lesson { gpu, domain: space_time, labels: &labels, axes: &[0, 1], parts: PARTS, base: None, seconds };
         let range = Some([space_time.min[2], space_time.max[2]]);
         let frequency = published_settings().map(|(name, settings)| (format!("{name}, frequencies, as published"), settings, PUBLISHED));
         let hashes = [
@@ -825,6 +845,90 @@ mod bench {
                 Ok(psnr(&found, &truth))
             })?;
             println!("| {name} | {:.1} {}", learned.megabytes, learned.row());
+        }
+        println!();
+        Ok(())
+    }
+
+    /// The unsteady ABC flow over x, y, z, the start time in [0, 2] and the duration in (0, 4]: a network of five inputs beside tables of five axes, which
+    /// are three-dimensional tables for each node of start and duration.
+    pub fn abc(seconds: f64) -> Outcome<()> {
+        const LATEST: f64 = 2.0;
+        const LONGEST: f64 = 4.0;
+        const LABELS: f64 = 8.0;
+        const TESTS: usize = 64;
+        const PARTS: usize = 16;
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let store = SnapshotStore::new(&gpu);
+        let flow = Analytic::Abc { a: 3.0_f64.sqrt(), b: 2.0_f64.sqrt(), c: 1.0, growth: 0.5 };
+        let domain = Domain::cuboid([0.0; 3], [std::f64::consts::TAU; 3]);
+        let source = VelocitySource::Analytic(flow, domain.clone());
+        let tracer = |[start, duration]: [f64; 2], per_unit: f64, precision| {
+            let steps = (per_unit * duration).ceil().max(1.0) as usize;
+            let map = FlowMap { precision, ..FlowMap::tangent(duration, steps) };
+            DeviceTracer::new(&store, &gpu, &source, &map, start, steps, Tuning::default())
+        };
+        // The additive recurrence of the plastic number fills the square of start and duration evenly (Roberts 2018).
+        let drawn = |number: u64| [0.754_877_666_246_693, 0.569_840_290_998_053].map(|step| (0.5 + number as f64 * step).fract());
+        let times = |[start, duration]: [f64; 2]| [start * LATEST, duration * LONGEST];
+        let drawer = drawer(&gpu, &domain)?;
+        let mut tests = Vec::new();
+        for test in 0..TESTS {
+            // Other times than those of the labels.
+            let at = drawn((1 << 32) + test as u64);
+            let (mut seeds, mut tested) = (Batch::new(&gpu, TESTED / TESTS)?, Batch::new(&gpu, TESTED / TESTS)?);
+            drawer.draw_points(&domain, 99, (test * TESTED) as u64, &mut seeds.points)?;
+            drawer.draw_points(&Domain::cuboid([0.0; 3], [1.0; 3]), 99, (test * TESTED) as u64, &mut tested.points)?;
+            seeds.trace(&tracer(times(at), 64.0, Precision::F64)?)?;
+            tests.push((at, tested, seeds.found()?));
+        }
+        let truth: Vec<f32> = tests.iter().flat_map(|(.., truth)| truth.iter().copied()).collect();
+
+        println!("<!-- block network-five-inputs -->");
+        println!("| table over x, y, z, start and duration | MB | traced in, s | PSNR, dB |\n|---|---|---|---|");
+        for n in [14, 22, 34, 48] {
+            let (mut found, mut traced) = (vec![vec![0.0f32; TESTED / TESTS]; TESTS], 0.0);
+            let at = |number: usize| number as f64 / (n - 1) as f64;
+            // At the duration 0 the log-stretch is 0.
+            for (start, duration) in (0..n).flat_map(|start| (1..n).map(move |duration| (start, duration))) {
+                let tracer = tracer(times([at(start), at(duration)]), LABELS, Precision::F32)?;
+                let mut table = DeviceTable::trace(&tracer, &domain, [n; 3])?;
+                let begin = gpu.mark()?;
+                table.retrace(&tracer)?;
+                traced += f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+                for ((of, tested, _), found) in tests.iter().zip(&mut found) {
+                    let near = |k: usize, number: usize| (1.0 - (of[k] * (n - 1) as f64 - number as f64).abs()).max(0.0);
+                    let weight = (near(0, start) * near(1, duration)) as f32;
+                    if weight > 0.0 {
+                        found.iter_mut().zip(tested.predict(&table)?).for_each(|(sum, value)| *sum += weight * value);
+                    }
+                }
+            }
+            println!("| {n}^5 | {:.1} | {traced:.3} | {:.1} |", 4e-6 * (n as f64).powi(5), psnr(&found.concat(), &truth));
+        }
+        println!();
+
+        println!("| network over x, y, z, start and duration | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|");
+        let labels = |batch: &Batch, number: u64| -> Outcome<Option<[f32; 2]>> {
+            let at = drawn(number);
+            let tracer = tracer(times(at), LABELS, Precision::F32)?;
+            batch.trace(&tracer)?;
+            // The tracer's memory is freed here.
+            gpu.synchronize()?;
+            Ok(Some(at.map(|share| share as f32)))
+        };
+        let lesson = Lesson { gpu: &gpu, domain: &domain, labels: &labels, axes: &[0, 1, 2], parts: PARTS, base: None, seconds };
+        for (name, settings) in published_settings().take(2) {
+            let settings = NetworkSettings { inputs: vec![Input::Start, Input::Duration], start_range: Some([0.0, LATEST]), ..settings };
+            let (learned, _) = lesson.learn(&settings, PUBLISHED, |network| {
+                let mut found = Vec::with_capacity(TESTED);
+                for (at, tested, _) in &tests {
+                    found.append(&mut tested.predict(&network.at(at.map(|share| share as f32)))?);
+                }
+                Ok(psnr(&found, &truth))
+            })?;
+            println!("| {name}, frequencies, as published | {:.1} {}", learned.megabytes, learned.row());
         }
         println!();
         Ok(())
@@ -851,7 +955,7 @@ mod bench {
     }
 
     /// Labels of a batch by a tracer.
-    fn traced_by(tracer: &DeviceTracer) -> impl Fn(&Batch, u64) -> Outcome<Option<f32>> {
+    fn traced_by(tracer: &DeviceTracer) -> impl Fn(&Batch, u64) -> Outcome<Option<[f32; 2]>> {
         |batch, _| Ok(batch.trace(tracer).map(|()| None)?)
     }
 
@@ -859,8 +963,11 @@ mod bench {
     struct Lesson<'a> {
         gpu: &'a Arc<Gpu>,
         domain: &'a Domain,
-        /// Labels the batch with this number; returns its duration as a share of the longest, if that is an input.
-        labels: &'a dyn Fn(&Batch, u64) -> Outcome<Option<f32>>,
+        /// Labels the batch with this number; returns its start (NaN: the points carry it in place of z) and its duration as shares of their ranges,
+        /// if these are inputs.
+        labels: &'a dyn Fn(&Batch, u64) -> Outcome<Option<[f32; 2]>>,
+        /// Axes of space.
+        axes: &'a [usize],
         /// Batches of a round.
         parts: usize,
         /// The table that the network adds to, and the seconds that it was traced in.
@@ -873,14 +980,13 @@ mod bench {
         fn append(&self, training: &DeviceTraining, to: &mut DeviceSamples, batch: &mut Batch, seed: u64, number: u64) -> Outcome<()> {
             let count = batch.points.len();
             training.draw_points(self.domain, seed, number * count as u64, &mut batch.points)?;
-            let duration = (self.labels)(batch, number)?;
+            let times = (self.labels)(batch, number)?;
             let (points, values, base) = (batch.points.address(), batch.values.address(), self.base.map(|(table, _)| table));
             // SAFETY: both buffers hold `count` entries.
             unsafe {
-                match duration {
+                match times {
                     None => training.append(to, self.domain, points, values, count, base)?,
-                    // The points carry their start.
-                    Some(duration) => training.append_at(to, self.domain, [points, values], count, [f32::NAN, duration])?,
+                    Some(times) => training.append_at(to, self.domain, [points, values], count, times)?,
                 }
             }
             Ok(())
@@ -893,9 +999,7 @@ mod bench {
             measure: impl Fn(NetworkAbove<'_>) -> Outcome<f64>,
         ) -> Outcome<(Learned, DeviceNetwork)> {
             const SCOUTS: usize = 1 << 14;
-            let Self { gpu, domain, parts, base, .. } = *self;
-            // The start time takes the third axis' place.
-            let axes = if settings.inputs.is_empty() { &[0, 1, 2][..domain.dimensions] } else { &[0, 1] };
+            let Self { gpu, domain, axes, parts, base, .. } = *self;
             let shape = Architecture::new(settings, axes, domain.lengths())?;
             let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
             let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK / parts)?, Batch::new(gpu, SCOUTS / parts)?);

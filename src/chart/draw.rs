@@ -55,7 +55,31 @@ fn plot_error(error: impl std::fmt::Display) -> DrawError {
 pub fn write_svg(chart: &Chart) -> Result<String, DrawError> {
     let mut text = String::new();
     let panels = panels(chart);
-    draw(&SVGBackend::with_string(&mut text, picture_size(&panels)).into_drawing_area(), chart, &panels)?;
+    draw(&SVGBackend::with_string(&mut text, picture_size(&panels)).into_drawing_area(), &title(chart), &panels)?;
+    Ok(text)
+}
+
+/// A curve with its name in the legend.
+pub type Curve = (String, Vec<(f64, f64)>);
+
+/// Draws the validation error over the epochs of trainings as SVG, both axes logarithmic.
+///
+/// # Errors
+/// plotters fails.
+pub fn write_epochs(title: &str, curves: &[Curve]) -> Result<String, DrawError> {
+    let series = curves.iter().map(|(name, points)| Series { name: name.clone(), points: points.clone(), is_line: true });
+    let panels = [Panel {
+        title: "Error on points that were not trained on".into(),
+        x: "epochs".into(),
+        y: "root mean square error of the log-stretch".into(),
+        is_y_log: true,
+        series: series.collect(),
+        front: Vec::new(),
+        pick: None,
+        levels: Vec::new(),
+    }];
+    let mut text = String::new();
+    draw(&SVGBackend::with_string(&mut text, picture_size(&panels)).into_drawing_area(), title, &panels)?;
     Ok(text)
 }
 
@@ -67,7 +91,7 @@ pub fn write_png(chart: &Chart) -> Result<Vec<u8>, DrawError> {
     let panels = panels(chart);
     let (width, height) = picture_size(&panels);
     let mut pixels = vec![0; (width * height * 3) as usize];
-    draw(&BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), chart, &panels)?;
+    draw(&BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), &title(chart), &panels)?;
     let picture = RgbImage::from_raw(width, height, pixels).ok_or_else(|| plot_error("the picture has another size than its buffer"))?;
     let mut bytes = Cursor::new(Vec::new());
     picture.write_to(&mut bytes, ImageFormat::Png)?;
@@ -197,17 +221,26 @@ fn scaling_panel(panel: &ScalingPanel, time_unit: &str) -> Option<Panel> {
     })
 }
 
-fn picture_size(panels: &[Panel]) -> (u32, u32) {
-    (WIDTH, 60 + ROW * panels.len().div_ceil(2).max(1) as u32)
+/// Rows and columns of panels.
+fn layout(panels: &[Panel]) -> (usize, usize) {
+    (panels.len().div_ceil(2).max(1), panels.len().clamp(1, 2))
 }
 
-fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, chart: &Chart, panels: &[Panel]) -> Result<(), DrawError> {
+fn picture_size(panels: &[Panel]) -> (u32, u32) {
+    let (rows, columns) = layout(panels);
+    (WIDTH / 2 * columns as u32, 60 + ROW * rows as u32)
+}
+
+fn title(chart: &Chart) -> String {
+    format!("{} (tau {}{}) on {}, {} CPU threads", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads)
+}
+
+fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[Panel]) -> Result<(), DrawError> {
     register_font(FONT, FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT).map_err(|_| plot_error("the built-in font is not read"))?;
     area.fill(&WHITE).map_err(plot_error)?;
-    let title = format!("{} (tau {}{}) on {}, {} CPU threads", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads);
     let (head, body) = area.split_vertically(60);
-    head.titled(&title, (FONT, 28)).map_err(plot_error)?;
-    for (panel, area) in panels.iter().zip(body.split_evenly((panels.len().div_ceil(2).max(1), 2))) {
+    head.titled(title, (FONT, 28)).map_err(plot_error)?;
+    for (panel, area) in panels.iter().zip(body.split_evenly(layout(panels))) {
         let (plot, legend) = area.split_horizontally(WIDTH / 2 - LEGEND);
         draw_legend(&legend, panel)?;
         let (x, y) = (span(panel, |(x, _)| x), span(panel, |(_, y)| y));

@@ -16,7 +16,7 @@ mod table;
 mod train;
 mod verdict;
 
-pub use draw::{DrawError, write_png, write_svg};
+pub use draw::{Curve, DrawError, write_epochs, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{Front, FtlePanel, FtlePoint};
 pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};

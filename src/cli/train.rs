@@ -4,8 +4,8 @@ use super::common::{Common, Interrupted, Usage, device, located, print_json, pri
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
-use ridgewatch::chart::{Epoch, TrainOptions, train};
-use ridgewatch::files::write_whole;
+use ridgewatch::chart::{Curve, Epoch, TrainOptions, train, write_epochs};
+use ridgewatch::files::{open, write_whole};
 use ridgewatch::publish::write_png;
 use ridgewatch::render::Film;
 use ridgewatch::run::RunError;
@@ -13,6 +13,9 @@ use ridgewatch::source::SourceKind;
 use ridgewatch::surrogate::Kind;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+
+/// Columns of epochs.csv.
+const HEAD: &str = "epoch,steps,seconds,loss,rms,psnr,rollbacks";
 
 /// Options of `train`.
 #[derive(Debug, clap::Args)]
@@ -29,9 +32,12 @@ pub struct Options {
     /// Epochs after which a picture of the network alone is written, besides the last one.
     #[arg(long, value_delimiter = ',', default_values_t = [1, 100], value_name = "EPOCHS")]
     pictures: Vec<u64>,
-    /// Folder for epochs.csv and the pictures. Files of these names are replaced.
+    /// Folder for epochs.csv, epochs.svg and the pictures. Files of these names are replaced.
     #[arg(long, short, default_value = "out/train")]
     out: PathBuf,
+    /// Folders of earlier trainings, whose curves are drawn beside this one, by the folders' names.
+    #[arg(long, num_args = 1.., value_name = "FOLDER")]
+    beside: Vec<PathBuf>,
 }
 
 /// Trains.
@@ -50,6 +56,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
             "network.inputs is given, and a still window has one start time and duration; accepted: a network over positions".into()
         ));
     }
+    let beside = options.beside.iter().map(|folder| read_curve(folder)).collect::<Result<Vec<Curve>>>()?;
     let device = device(common, &scene)?;
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
     let wanted = TrainOptions {
@@ -77,13 +84,17 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     if let Some(error) = failed {
         return Err(error.into());
     }
-    write_epochs(&options.out.join("epochs.csv"), &report.epochs)?;
+    write_csv(&options.out.join("epochs.csv"), &report.epochs)?;
+    let own = (name_of(&options.out), report.epochs.iter().map(|epoch| (epoch.epoch as f64, epoch.rms)).collect());
+    let curves: Vec<Curve> = beside.into_iter().chain([own]).collect();
+    let path = options.out.join("epochs.svg");
+    write_whole(&path, write_epochs(&scene.title, &curves)?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
     if common.json {
         print_json(&report)?;
     } else if let Some(last) = report.epochs.last() {
         let psnr = last.psnr.map_or(String::new(), |psnr| format!(", {psnr:.1} dB"));
         print_text(format_args!(
-            "{}: epochs.csv, epoch_*.png; after {} epochs ({} steps, {:.1} s, {:.1} MB) the log-stretch has an error of {:.4}{psnr}",
+            "{}: epochs.csv, epochs.svg, epoch_*.png; after {} epochs ({} steps, {:.1} s, {:.1} MB) the log-stretch has an error of {:.4}{psnr}",
             options.out.display(),
             last.epoch,
             last.steps,
@@ -98,8 +109,32 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
 }
 
-fn write_epochs(path: &Path, epochs: &[Epoch]) -> Result<()> {
-    let mut text = String::from("epoch,steps,seconds,loss,rms,psnr,rollbacks\n");
+fn name_of(folder: &Path) -> String {
+    folder.file_name().map_or_else(|| folder.display().to_string(), |name| name.to_string_lossy().into_owned())
+}
+
+/// The curve of an earlier training.
+fn read_curve(folder: &Path) -> Result<Curve> {
+    let path = folder.join("epochs.csv");
+    let text = open(&path).and_then(std::io::read_to_string).with_context(|| format!("--beside: cannot read {}", path.display()))?;
+    let mut lines = text.lines();
+    let head = lines.next().unwrap_or_default();
+    if head != HEAD {
+        bail!("{}: found the head {head:?}; accepted: {HEAD:?}, as this program writes it", path.display());
+    }
+    let mut points = Vec::new();
+    for (number, line) in lines.enumerate() {
+        let cell = |i: usize| line.split(',').nth(i).and_then(|cell| cell.parse().ok());
+        let (Some(epoch), Some(rms)) = (cell(0), cell(4)) else {
+            bail!("{}, line {}: found {line:?}; accepted: {HEAD}", path.display(), number + 2);
+        };
+        points.push((epoch, rms));
+    }
+    Ok((name_of(folder), points))
+}
+
+fn write_csv(path: &Path, epochs: &[Epoch]) -> Result<()> {
+    let mut text = format!("{HEAD}\n");
     let number = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6e}"));
     for Epoch { epoch, steps, seconds, loss, rms, psnr, rollbacks } in epochs {
         // Writing into a string does not fail.

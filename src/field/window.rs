@@ -1,6 +1,6 @@
 //! The sliding window: exactly the snapshots that an integration over [t0, t0 + tau] needs.
 
-use super::{Grid, Snapshot};
+use super::{Geometry, Grid, Snapshot};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use thiserror::Error;
@@ -202,6 +202,21 @@ impl Window {
         thinned
     }
 
+    /// Whether all levels (nodes of the third axis, two or more) have the same velocity in every snapshot, and none across them.
+    pub fn is_flat(&self) -> bool {
+        let Some(grid) = self.grid() else { return false };
+        let [nx, ny, nz] = grid.shape();
+        // See `Snapshot::nodes`.
+        let across = if matches!(grid.geometry, Geometry::Sphere { .. }) { 3 } else { 2 };
+        let is_same = |(a, b): (&[f32; 4], &[f32; 4])| (0..4).all(|k| a[k] == b[k] || a[k].is_nan() && b[k].is_nan());
+        nz > 1
+            && self.snapshots.iter().all(|snapshot| {
+                let mut levels = snapshot.nodes.chunks_exact(nx * ny);
+                let first = levels.next().unwrap_or_default();
+                first.iter().all(|node| node[across] == 0.0 || node[3].is_nan()) && levels.all(|level| first.iter().zip(level).all(is_same))
+            })
+    }
+
     /// Memory of all nodes, in bytes.
     pub fn bytes(&self) -> usize {
         self.snapshots.iter().map(|s| s.bytes()).sum()
@@ -211,11 +226,39 @@ impl Window {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axis, Geometry};
+    use crate::Axis;
 
     fn grid(nodes: usize) -> Arc<Grid> {
         let axis = |name| Axis::uniform(name, "m", 0.0, 1.0, nodes).unwrap();
         Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) })
+    }
+
+    #[test]
+    fn a_window_is_flat_if_its_levels_are_alike_and_nothing_crosses_them() {
+        let axis = |name, nodes| Axis::uniform(name, "m", 0.0, 1.0, nodes).unwrap();
+        let flat = |levels: usize, node: &dyn Fn(usize, usize) -> [f32; 3]| {
+            let axes = vec![axis("x", 3), axis("y", 2), axis("z", levels)];
+            let grid = Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+            let mut window = Window::new(1.0);
+            for time in 0..3 {
+                let of = |k: usize| (0..6 * levels).map(|i| node(time, i)[k]).collect::<Vec<f32>>();
+                window.push(Arc::new(Snapshot::from_components(time as f64, grid.clone(), &of(0), &of(1), &of(2)))).unwrap();
+            }
+            window.is_flat()
+        };
+        let alike = |time: usize, i: usize| [(i % 6 + time) as f32, if i % 6 == 4 { f32::NAN } else { 1.0 }, 0.0];
+        assert!(flat(2, &alike) && flat(5, &alike), "missing nodes are alike too");
+        assert!(!flat(1, &alike), "one level is a plane already");
+        for (time, i, component, value) in [(2, 29, 0, 7.5), (0, 13, 1, 1.5), (1, 2, 2, 1e-9), (1, 22, 1, 0.0)] {
+            let odd = |t: usize, j: usize| {
+                let mut node = alike(t, j);
+                if (t, j) == (time, i) {
+                    node[component] = value;
+                }
+                node
+            };
+            assert!(!flat(5, &odd), "{time} {i} {component}");
+        }
     }
 
     fn at(time: f64, grid: &Arc<Grid>) -> Arc<Snapshot> {

@@ -39,7 +39,7 @@ pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
 pub use settings::MAX_FRAMES_UNTIL;
 pub use settings::MAX_SAMPLES;
-pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
+pub use settings::{Albedo, CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
 pub use space::{GridPoint, SceneBox, overview_scale};
 pub use tracking::FrameScene;
 pub use transfer::{Transfer, map_range};

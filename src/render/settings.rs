@@ -214,6 +214,10 @@ impl Default for TransferSettings {
     }
 }
 
+/// A value of `transfer.albedo`: coefficients, or the name of a preset.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Albedo(#[serde(deserialize_with = "albedo_or_preset")] pub [Vec<f64>; 3]);
+
 fn albedo_or_preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[Vec<f64>; 3], D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "accepted: the name of a preset, or three lists of polynomial coefficients")]

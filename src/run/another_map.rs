@@ -10,7 +10,7 @@ use super::transaction::{transaction, with};
 use super::{RunError, TransferRecord};
 use crate::backend::Backend;
 use crate::flow::{FlowMap, Steps, VelocitySource, time_resolution};
-use crate::render::{Renderer, Scene};
+use crate::render::{Renderer, Scene, TransferSettings};
 use crate::surrogate::network::Times;
 use crate::surrogate::{ReplayBuffer, Sizing, Trace};
 
@@ -92,6 +92,7 @@ impl<B: Backend> Cycle<'_, B> {
         let mut scene = self.run.renderer.scene().clone();
         if !self.run.has_range {
             let plan = self.run.plan;
+            let albedo = scene.transfer.albedo.clone();
             scene.transfer = loop {
                 let (stop, method) = (self.run.stop, self.run.render.method);
                 let settled = with!(&self.session, on => {
@@ -105,6 +106,7 @@ impl<B: Backend> Cycle<'_, B> {
                     settled => break settled?,
                 }
             };
+            scene.transfer = TransferSettings { extinction: self.run.extinction.or(scene.transfer.extinction), albedo, ..scene.transfer };
         }
         let run = &mut self.run;
         let (plan, tau) = (run.plan, self.map.tau);

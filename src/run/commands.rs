@@ -54,23 +54,31 @@ impl Run<'_> {
     }
 
     fn apply(&mut self, Command { set, .. }: &Command) -> Result<(), RenderError> {
-        if set.camera.is_some() || set.range.is_some() {
+        let has_colours = set.range.is_some() || set.extinction.is_some() || set.albedo.is_some();
+        if set.camera.is_some() || has_colours {
             let mut scene = self.renderer.scene().clone();
             scene.camera = set.camera.clone().unwrap_or(scene.camera);
             if let Some(Range { low, high }) = set.range {
                 (scene.transfer.low, scene.transfer.high) = (Some(low), Some(high));
             }
+            scene.transfer.extinction = set.extinction.or(scene.transfer.extinction);
+            scene.transfer.albedo = set.albedo.clone().unwrap_or(scene.transfer.albedo);
             let renderer = &mut self.renderer;
             self.threads.render().install(|| renderer.set_scene(scene))?;
         }
-        if let Some(Range { low, high }) = set.range {
-            Decision::withdraw(&mut self.report.decisions, &["transfer.low", "transfer.high"]);
-            self.transfer = TransferRecord { low, high, ..self.transfer };
+        if has_colours {
+            let extinction = f64::from(self.renderer.transfer().extinction_max());
+            let Range { low, high } = set.range.unwrap_or(Range { low: self.transfer.low, high: self.transfer.high });
+            self.transfer = TransferRecord { low, high, extinction };
             self.report.transfer = Some(self.transfer);
+        }
+        if set.range.is_some() {
+            Decision::withdraw(&mut self.report.decisions, &["transfer.low", "transfer.high"]);
             // Its residuals are those of another ramp.
             self.learning.trust.reset();
         }
         self.has_range |= set.range.is_some();
+        self.extinction = set.extinction.or(self.extinction);
         // The flow map follows once all commands are applied.
         self.asked = asked(&self.plan.map, &self.asked, set);
         if set.method.is_some() || set.budget.is_some() {

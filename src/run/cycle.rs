@@ -36,6 +36,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+/// What is said of a window that is flat.
+const FLAT: &str = "all levels of the first window have the same velocity, and none crosses them: one of them (archive.level) gives the same FTLE, \
+                    unless it is negative, for less";
+
 /// Options of a run besides its scene.
 #[derive(Debug, Clone, Default)]
 pub struct RunOptions {
@@ -164,6 +168,8 @@ pub(super) struct Run<'a> {
     pub(super) transfer: TransferRecord,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
+    /// Full extinction, if a command set it.
+    pub(super) extinction: Option<f64>,
     pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
@@ -376,6 +382,11 @@ fn drive<B: Backend>(
     let from = RunGiven { plan: &plan, options, threads, stop, began, earlier_race, report };
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
+    if let VelocitySource::Window(window) = &slide.velocity
+        && run.threads.render().install(|| window.is_flat())
+    {
+        sink(Event::Note(FLAT.into()));
+    }
     let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None, compared: None };
     if let Some(chosen) = chosen {
         cycle.take_steps(chosen, None);
@@ -531,6 +542,7 @@ impl<'a> Run<'a> {
             render,
             transfer,
             has_range: false,
+            extinction: None,
             color_bar,
             learning,
             progress,

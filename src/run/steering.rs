@@ -4,7 +4,7 @@ use super::setup::{Plan, assemble};
 use super::slides::closed_form;
 use crate::field::Domain;
 use crate::flow::{Direction, Steps};
-use crate::render::{Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
+use crate::render::{ALBEDO_PRESETS, Albedo, Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, require, shown};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
@@ -24,6 +24,12 @@ pub struct Change {
     /// FTLE (1/time) at which extinction begins and is full.
     #[serde(rename = "transfer", default, skip_serializing_if = "Option::is_none")]
     pub range: Option<Range>,
+    /// Full extinction, 1/length.
+    #[serde(rename = "transfer.extinction", default, skip_serializing_if = "Option::is_none")]
+    pub extinction: Option<f64>,
+    /// Polynomial coefficients of the red, green and blue albedo.
+    #[serde(rename = "transfer.albedo", default, skip_serializing_if = "Option::is_none")]
+    pub albedo: Option<[Vec<f64>; 3]>,
     /// Source of the answers to queries.
     #[serde(rename = "render.method", default, skip_serializing_if = "Option::is_none")]
     pub method: Option<Method>,
@@ -61,6 +67,8 @@ impl Change {
         self.camera = self.camera.take().filter(|_| later.camera.is_none());
         self.tolerance = self.tolerance.filter(|_| later.tolerance.is_none());
         self.range = self.range.filter(|_| later.range.is_none());
+        self.extinction = self.extinction.filter(|_| later.extinction.is_none());
+        self.albedo = self.albedo.take().filter(|_| later.albedo.is_none());
         self.method = self.method.filter(|_| later.method.is_none());
         self.budget = self.budget.filter(|_| later.budget.is_none());
         self.tau = self.tau.filter(|_| later.tau.is_none());
@@ -215,9 +223,19 @@ impl Steering {
                 }
                 "transfer" => {
                     let range: Range = read(key, value, "low and high, two numbers")?;
-                    let settings = TransferSettings { low: Some(range.low), high: Some(range.high), ..self.transfer.clone() };
-                    Transfer::new(&settings, 1.0).map_err(Refused::from)?;
+                    self.check_transfer(TransferSettings { low: Some(range.low), high: Some(range.high), ..self.transfer.clone() })?;
                     change.range = Some(range);
+                }
+                "transfer.extinction" => {
+                    let extinction = read(key, value, "a number from 0 up, per unit of length")?;
+                    self.check_transfer(TransferSettings { extinction: Some(extinction), ..self.transfer.clone() })?;
+                    change.extinction = Some(extinction);
+                }
+                "transfer.albedo" => {
+                    let accepted = format!("{}, or three lists of coefficients", ALBEDO_PRESETS.join(", "));
+                    let Albedo(albedo) = read(key, value, &accepted)?;
+                    self.check_transfer(TransferSettings { albedo: albedo.clone(), ..self.transfer.clone() })?;
+                    change.albedo = Some(albedo);
                 }
                 "render.method" => {
                     let method = read(key, value, METHODS)?;
@@ -233,8 +251,8 @@ impl Steering {
                     self.check_times(key, value)?;
                 }
                 other => {
-                    let accepted = "camera, trust.tolerance, transfer, render.method, render.budget, time.tau, time.direction and paused: \
-                        all else stays as the run began";
+                    let accepted = "camera, trust.tolerance, transfer, transfer.extinction, transfer.albedo, render.method, render.budget, \
+                        time.tau, time.direction and paused: all else stays as the run began";
                     return Err(Refused::new(other, "cannot change during a run", accepted));
                 }
             }
@@ -249,6 +267,10 @@ impl Steering {
             RenderSettings { method, budget: Some(budget), ..self.render.clone() }.check().map_err(Refused::from)?;
         }
         Ok(change)
+    }
+
+    fn check_transfer(&self, settings: TransferSettings) -> Result<(), Refused> {
+        Transfer::new(&settings, 1.0).map(|_| ()).map_err(Refused::from)
     }
 
     /// A duration that the window holds.
@@ -406,6 +428,13 @@ mod tests {
             (json!({"trust.tolerance": "low"}), "`trust.tolerance` is \"low\"; accepted: a number above 0"),
             (json!({"transfer": {"low": 2, "high": 1}}), "`transfer.high` is 1.0"),
             (json!({"transfer": {"low": 2}}), "`transfer` cannot be read (missing field `high`)"),
+            (json!({"transfer.extinction": -1}), "`transfer.extinction` is -1.0; accepted:"),
+            (json!({"transfer.extinction": "thick"}), "`transfer.extinction` is \"thick\"; accepted: a number from 0 up"),
+            (
+                json!({"transfer.albedo": "rainbow"}),
+                "`transfer.albedo` is \"rainbow\"; accepted: published, grey, ember, deep, or three lists",
+            ),
+            (json!({"transfer.albedo": [[2.0], [0.0], [0.0]]}), "`transfer.albedo`"),
             (json!({"paused": 1}), "`paused` is 1; accepted: true or false"),
             (json!({"time.direction": "sideways"}), "`time.direction` is \"sideways\"; accepted: \"forward\" or \"backward\""),
             (json!({"time.tau": 10.5}), "`time.tau` is 10.5; accepted: a number above 0, at most 10: the window"),

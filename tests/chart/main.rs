@@ -139,6 +139,9 @@ fn the_error_of_fewer_snapshots_falls_with_their_number() {
     assert!(chart["verdict"].to_string().contains("rms from that of all snapshots"), "{}", chart["verdict"]);
 }
 
+/// Columns of a training's table.
+const HEAD: &str = "epoch,steps,seconds,loss,rms,psnr,rollbacks";
+
 #[test]
 fn training_lowers_the_error_on_points_it_never_sees() {
     let folder = tempfile::tempdir().unwrap();
@@ -147,9 +150,10 @@ fn training_lowers_the_error_on_points_it_never_sees() {
         ["--set", "surrogate.kind=network", "--set", "network.log2_table=12", "--set", "network.width=16", "--set", "network.batch=4096"];
     let given = [&network[..], &["--epochs", "12", "--labels", "65536", "--pictures", "1,3"]].concat();
     run(&mut ridgewatch(command("train", &out, &given))).success();
-    let text = std::fs::read_to_string(out.join("epochs.csv")).unwrap();
+    let written = std::fs::read_to_string(out.join("epochs.csv")).unwrap();
+    assert_eq!(written.lines().next(), Some(HEAD));
     let rows: Vec<Vec<f64>> =
-        text.lines().skip(1).map(|line| line.split(',').map(|cell| cell.parse().unwrap_or(f64::NAN)).collect()).collect();
+        written.lines().skip(1).map(|line| line.split(',').map(|cell| cell.parse().unwrap_or(f64::NAN)).collect()).collect();
     assert_eq!(rows.len(), 12);
     // 65536 labels in batches of 4096 are 16 steps an epoch.
     assert_eq!([rows[0][1], rows[11][1]], [16.0, 192.0]);
@@ -157,6 +161,15 @@ fn training_lowers_the_error_on_points_it_never_sees() {
     for epoch in [1, 3, 12] {
         assert!(out.join(format!("epoch_{epoch:06}.png")).exists(), "{epoch}");
     }
+    assert!(std::fs::read_to_string(out.join("epochs.svg")).unwrap().contains("<svg"));
+    // Another training is drawn beside it, each by the name of its folder.
+    let second = folder.path().join("second");
+    let given = [&network[..], &["--epochs", "2", "--labels", "8192", "--beside", text(&out)]].concat();
+    run(&mut ridgewatch(command("train", &second, &given))).success();
+    let drawn = std::fs::read_to_string(second.join("epochs.svg")).unwrap();
+    assert!([">\ntrain\n<", ">\nsecond\n<"].iter().all(|name| drawn.contains(name)), "{drawn}");
+    std::fs::write(out.join("epochs.csv"), format!("{HEAD}\n1,16,0.1\n")).unwrap();
+    run(&mut ridgewatch(command("train", &second, &given))).refused(1, &["epochs.csv, line 2", "1,16,0.1", "accepted: epoch,steps"]);
     run(&mut ridgewatch(command("train", &out, &[]))).refused(2, &["a table is not trained", "surrogate.kind"]);
 }
 

@@ -71,6 +71,31 @@ fn a_command_is_in_effect_and_in_the_record_of_the_next_frame() {
     }
 }
 
+/// Extinction and albedo change the picture alone, and stay with another tau, whose range is chosen anew.
+#[test]
+fn extinction_and_albedo_are_those_of_the_latest_command() {
+    let keys = "time.frames_per_slide = 6\nrender.method = \"two_level\"\nlight.radiance = [4, 4, 4]\n";
+    let (frames, _) = steered(scene(keys), |steering, frame| {
+        match frame.record.frame {
+            0 => command(steering, json!({"transfer.extinction": 2.5})),
+            2 => command(steering, json!({"transfer.albedo": "deep"})),
+            4 => command(steering, json!({"time.tau": 5})),
+            _ => {}
+        }
+        false
+    });
+    let transfer: Vec<_> = frames.iter().map(|frame| frame.record.transfer).collect();
+    assert!(transfer[0].extinction > 3.0, "the scene leaves it open: {transfer:?}");
+    assert!(transfer[1..].iter().all(|transfer| transfer.extinction == 2.5), "{transfer:?}");
+    assert!(transfer[..5].iter().all(|t| t.low == transfer[0].low) && transfer[5].low != transfer[0].low, "{transfer:?}");
+    let bar = |frame: usize| &frames[frame].color_bar.as_ref().unwrap().colors;
+    assert!(bar(0) != bar(1) && bar(1) == bar(2) && bar(2) != bar(3) && bar(3) == bar(5));
+    assert!(frames[1].film.rgba[..] != frames[0].film.rgba[..] && frames[3].film.rgba[..] != frames[2].film.rgba[..]);
+    // Thinner, the picture lets more of the background through.
+    let opacity = |frame: usize| frames[frame].film.rgba.iter().map(|pixel| f64::from(pixel[3])).sum::<f64>();
+    assert!(opacity(1) < 0.9 * opacity(0), "{} after {}", opacity(1), opacity(0));
+}
+
 /// A finer tolerance, and a steeper ramp, show an error of the integration that the former ones did not.
 #[test]
 fn the_steps_of_the_integration_follow_tolerance_and_colours() {

@@ -275,9 +275,9 @@ function showSteering() {
   for (const [id, value] of Object.entries({ method, direction })) if (document.activeElement !== element(id)) element(id).value = value ?? "";
   element("tau").max = longest ?? "";
   element("budget").disabled = method !== "two_level";
-  element("tolerance").disabled = method === "map";
+  for (const id of ["tolerance", "extinction", "albedo"]) element(id).disabled = method === "map";
   element("method").options[0].disabled = steering.ready?.dimensions !== 2;
-  const values = { budget, tau, tolerance: newest?.tolerance, ...(histogram.range ?? { low: null, high: null }) };
+  const values = { budget, tau, tolerance: newest?.tolerance, extinction: newest?.transfer?.extinction, ...(histogram.range ?? { low: null, high: null }) };
   for (const [id, value] of Object.entries(values)) {
     // Not while it is typed.
     if (document.activeElement !== element(id)) element(id).value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
@@ -397,14 +397,16 @@ element("field").addEventListener("click", showField);
 element("pause").addEventListener("click", () => steering.togglePause());
 element("home").addEventListener("click", () => steering.home());
 element("share").addEventListener("click", share);
-for (const [id, key] of [["tolerance", "trust.tolerance"], ["budget", "render.budget"], ["tau", "time.tau"]]) {
+for (const [id, key] of [["tolerance", "trust.tolerance"], ["extinction", "transfer.extinction"], ["budget", "render.budget"], ["tau", "time.tau"]]) {
   element(id).addEventListener("change", ({ target }) => {
     if (Number.isFinite(target.valueAsNumber)) steering.command({ [key]: target.valueAsNumber });
   });
 }
-for (const [id, key] of [["method", "render.method"], ["direction", "time.direction"]]) {
+for (const [id, key] of [["method", "render.method"], ["direction", "time.direction"], ["albedo", "transfer.albedo"]]) {
   element(id).addEventListener("change", ({ target }) => {
     steering.command({ [key]: target.value });
+    // The colours in effect are in the colour bar.
+    if (id === "albedo") target.value = "";
     // Its keys are shortcuts again, and a value that is refused is not shown.
     target.blur();
   });

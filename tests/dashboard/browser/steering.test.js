@@ -232,6 +232,23 @@ test("other colours change the picture, and nothing is traced anew for them", as
   });
 });
 
+test("extinction and palette are in effect with a later record", async () => {
+  await steered("box", async (page, where) => {
+    const { frame, transfer } = newest(where);
+    await until("the extinction is shown", async () => Math.abs(Number(await page.inputValue("#extinction")) / transfer.extinction - 1) < 1e-4);
+    await page.fill("#extinction", "3.5");
+    await page.press("#extinction", "Enter");
+    const record = await commanded(where, frame, ["transfer.extinction"]);
+    assert.deepEqual(record.transfer, { ...transfer, extinction: 3.5 });
+    await page.selectOption("#albedo", "deep");
+    await commanded(where, record.frame, ["transfer.albedo"]);
+    assert.equal(await page.inputValue("#albedo"), "");
+    await page.fill("#extinction", "-1");
+    await page.press("#extinction", "Enter");
+    await until("it is refused", async () => /Refused: `transfer.extinction` is -1.0/.test(await page.textContent("#warnings")));
+  });
+});
+
 test("method and budget are in effect with a later record, and a budget needs its method", async () => {
   await steered("map", async (page, where) => {
     const { frame, method } = newest(where);
