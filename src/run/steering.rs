@@ -228,13 +228,13 @@ impl Steering {
                 }
                 "transfer.extinction" => {
                     let extinction = read(key, value, "a number from 0 up, per unit of length")?;
-                    self.check_transfer(TransferSettings { extinction: Some(extinction), ..self.transfer.clone() })?;
+                    self.check_transfer(TransferSettings { extinction: Some(extinction), ..any_range() })?;
                     change.extinction = Some(extinction);
                 }
                 "transfer.albedo" => {
                     let accepted = format!("{}, or three lists of coefficients", ALBEDO_PRESETS.join(", "));
                     let Albedo(albedo) = read(key, value, &accepted)?;
-                    self.check_transfer(TransferSettings { albedo: albedo.clone(), ..self.transfer.clone() })?;
+                    self.check_transfer(TransferSettings { albedo: albedo.clone(), ..any_range() })?;
                     change.albedo = Some(albedo);
                 }
                 "render.method" => {
@@ -367,6 +367,11 @@ pub(super) fn drawn_by(render: &RenderSettings, method: Method, budget: Option<f
 }
 
 /// Reads a value; a fault names the key inside it.
+/// A transfer function for what does not depend on its range.
+fn any_range() -> TransferSettings {
+    TransferSettings { low: Some(0.0), high: Some(1.0), ..TransferSettings::default() }
+}
+
 fn read<'a, T: Deserialize<'a>>(key: &str, value: &'a Value, accepted: &str) -> Result<T, Refused> {
     serde_path_to_error::deserialize(value).map_err(|error| {
         let inner = error.path().to_string();

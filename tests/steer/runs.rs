@@ -74,7 +74,7 @@ fn a_command_is_in_effect_and_in_the_record_of_the_next_frame() {
 /// Extinction and albedo change the picture alone, and stay with another tau, whose range is chosen anew.
 #[test]
 fn extinction_and_albedo_are_those_of_the_latest_command() {
-    let keys = "time.frames_per_slide = 6\nrender.method = \"two_level\"\nlight.radiance = [4, 4, 4]\n";
+    let keys = "time.frames_per_slide = 6\nrender.method = \"two_level\"\n";
     let (frames, _) = steered(scene(keys), |steering, frame| {
         match frame.record.frame {
             0 => command(steering, json!({"transfer.extinction": 2.5})),
