@@ -793,7 +793,7 @@ fn checkpoints_while_a_device_trains() {
 /// A window is held in half precision as long as the picture does not show it.
 #[test]
 fn half_precision_is_given_up_where_the_picture_shows_it() {
-    let keys = "
+    let text = "
         source.nodes = [24, 12, 12]
         source.snapshots = 8
         time.tau = 4
@@ -803,7 +803,7 @@ fn half_precision_is_given_up_where_the_picture_shows_it() {
         render.method = \"two_level\"
         surrogate.kind = \"table\"
     ";
-    let scene = scene::parse(&scene::scene("turbulence", [24, 12, 4], keys), &[]).unwrap();
+    let scene = scene::parse(&scene::scene("turbulence", [24, 12, 4], text), &[]).unwrap();
     let whole = Line::new(usize::MAX, How::Fault);
     let on = |line: &Arc<Line>, bits: fn(f64) -> i32| made(Breaking { half: Half::of(bits), ..Breaking::on(line) }, &scene);
     let decision = |made: &Made| made.decisions.iter().find(|d| d.setting == "device.storage").map(|d| (d.chosen.clone(), d.why.clone()));
@@ -826,14 +826,28 @@ fn half_precision_is_given_up_where_the_picture_shows_it() {
     assert!(chosen == "f32" && later.films[..3] == half.films[..3] && later.films[3..] != half.films[3..], "{chosen}");
 
     // Where steps are given, nothing is compared.
-    let given = scene::parse(&scene::scene("turbulence", [24, 12, 4], keys), &["flow.steps=8"]).unwrap();
-    let given = made(Breaking { half: Half::of(|_| 3), ..Breaking::on(&whole) }, &given);
-    assert_eq!(decision(&given), None);
+    for keys in [&["flow.steps=8"][..], &["flow.tolerance=0.1"], &["flow.precision=\"f64\""]] {
+        let given = scene::parse(&scene::scene("turbulence", [24, 12, 4], text), keys).unwrap();
+        let found = made(Breaking { half: Half::of(|_| 1), ..Breaking::on(&whole) }, &given);
+        assert_eq!(decision(&found), None, "{keys:?}");
+        assert!(found.films == made(ridgewatch::backend::Cpu, &given).films, "{keys:?}");
+    }
+
+    // Steps whose own error a later slide makes larger are no error of the storage.
+    for tolerance in ["0.003", "0.006", "0.01", "0.02"] {
+        let keys = [&format!("trust.tolerance={tolerance}")[..]];
+        let rough = scene::parse(&scene::scene("turbulence", [24, 12, 4], text), &keys).unwrap();
+        let (chosen, why) = decision(&made(Breaking { half: Half::of(|_| 20), ..Breaking::on(&whole) }, &rough)).unwrap();
+        assert_eq!(chosen, "f16_pairs", "{tolerance}: {why}");
+    }
 
     let calls = whole.calls.lock().unwrap().len();
-    for breaks_at in points(6, calls / 4) {
+    for breaks_at in points(6, calls / 8).into_iter().chain([2, 3, 4]) {
         let line = Line::new(breaks_at, How::Fault);
-        let lost = on(&line, |_| 11);
+        let lost = on(&line, |_| 1);
         assert!(lost.error.is_none() && lost.films.len() == single.films.len(), "{breaks_at}: {:?}", lost.error);
+        // Nothing is said of half precision for paths of the CPU; films are those of single precision in any case.
+        let is_said = decision(&lost).is_some();
+        assert!(lost.films == single.films && (!is_said || line.calls.lock().unwrap().len() > 3), "{breaks_at}: {is_said}");
     }
 }

@@ -19,6 +19,8 @@ const WIDTH: u32 = 1800;
 const ROW: u32 = 620;
 /// Width of the legend beside each panel.
 const LEGEND: u32 = 270;
+/// Most points of a line that are marked besides.
+const MARKED: usize = 60;
 /// Font that is built in, so that a chart looks the same on every machine.
 const FONT: &str = "sans-serif";
 
@@ -62,7 +64,7 @@ pub fn write_svg(chart: &Chart) -> Result<String, DrawError> {
 /// A curve with its name in the legend.
 pub type Curve = (String, Vec<(f64, f64)>);
 
-/// Draws the validation error over the epochs of trainings as SVG, both axes logarithmic.
+/// Draws the validation error over the epochs of trainings as SVG; the epochs, and errors of more than a decade, on logarithmic axes.
 ///
 /// # Errors
 /// plotters fails.
@@ -72,7 +74,11 @@ pub fn write_epochs(title: &str, curves: &[Curve]) -> Result<String, DrawError> 
         title: "Error on points that were not trained on".into(),
         x: "epochs".into(),
         y: "root mean square error of the log-stretch".into(),
-        is_y_log: true,
+        is_y_log: {
+            let errors = || curves.iter().flat_map(|(_, points)| points).map(|(_, error)| *error).filter(|error| *error > 0.0);
+            // Within a decade a logarithmic axis has no labels.
+            errors().fold(0.0, f64::max) > 10.0 * errors().fold(f64::INFINITY, f64::min)
+        },
         series: series.collect(),
         front: Vec::new(),
         pick: None,
@@ -247,7 +253,7 @@ fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[
         if panel.is_y_log {
             draw_panel(&plot, panel, log(x).log_scale(), log(y).log_scale())?;
         } else {
-            let margin = 0.05 * (y.end - y.start).max(1.0);
+            let margin = 0.05 * (y.end - y.start);
             draw_panel(&plot, panel, log(x).log_scale(), y.start - margin..y.end + margin)?;
         }
     }
@@ -284,6 +290,8 @@ where
     X::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
     Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
 {
+    let levels = span(panel, |(_, y)| y);
+    let is_fine = levels.end - levels.start < 10.0;
     let mut plot = ChartBuilder::on(area)
         .caption(&panel.title, (FONT, 20))
         .margin(12)
@@ -297,7 +305,7 @@ where
         .label_style((FONT, 15))
         .axis_desc_style((FONT, 17))
         .x_label_formatter(&power)
-        .y_label_formatter(&|y| if panel.is_y_log { power(y) } else { format!("{y:.0}") })
+        .y_label_formatter(&|y| if panel.is_y_log || is_fine { power(y) } else { format!("{y:.0}") })
         .light_line_style(WHITE)
         .draw()
         .map_err(plot_error)?;
@@ -312,6 +320,9 @@ where
         let finite: Vec<(f64, f64)> = series.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
         if series.is_line {
             plot.draw_series(LineSeries::new(finite.iter().copied(), colour.stroke_width(2))).map_err(plot_error)?;
+        }
+        if series.is_line && finite.len() > MARKED {
+            continue;
         }
         if number < COLOURS.len() {
             plot.draw_series(finite.iter().map(|&at| Circle::new(at, 5, colour.filled()))).map_err(plot_error)?;

@@ -1,7 +1,7 @@
 //! The FTLE field of the slide that the run shows, as a file. It is traced beside the run, on few threads, one at a time for all pages.
 
 use super::access::parameter;
-use super::pixels::{ELSEWHERE, Pixels, Refusal, Sent, no_field, refused, whole};
+use super::pixels::{NOT_SENT, Pixels, Refusal, Sent, no_field, refused, whole};
 use crate::publish::{NewestFrame, SlideField};
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -56,7 +56,7 @@ impl Fields {
     /// # Errors
     /// The slide is not kept, or the field of another one is being traced.
     fn of(self: &Arc<Self>, slide: Option<u64>, newest: &Arc<NewestFrame>) -> Result<Option<Arc<Job>>, Refusal> {
-        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
+        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, NOT_SENT.to_owned()))?;
         let shown = slides.index();
         let mut kept = self.lock();
         match &*kept {
@@ -123,7 +123,7 @@ impl Pixels {
     }
 
     fn field_of(&self, uri: &Uri) -> Result<Response, Refusal> {
-        let newest = self.newest.as_ref().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
+        let newest = &self.newest;
         let accepted = "the number of a slide, or none for the newest";
         let slide = parameter(uri, "slide").map(|text| whole("slide", text, accepted)).transpose()?;
         let Some(job) = self.fields.of(slide, newest)? else {

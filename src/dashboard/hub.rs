@@ -2,6 +2,7 @@
 
 use super::metrics::{Metrics, Server};
 use super::pixels::{Kept, Pixels};
+use super::received::{Received, decode};
 use super::steering::{Answer, Reach, Wheel};
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
 use bytes::Bytes;
@@ -204,7 +205,7 @@ impl Hub {
                     lock(&self.health).connected();
                     let error = loop {
                         match subscriber.receive().await {
-                            Ok(parts) => self.take(&parts),
+                            Ok(parts) => self.take(&parts).await,
                             Err(error) => break error,
                         }
                     };
@@ -231,10 +232,10 @@ impl Hub {
     }
 
     /// Takes a published message.
-    fn take(&self, parts: &[Bytes]) {
+    async fn take(&self, parts: &[Bytes]) {
         let taken = match parts {
             [topic, record] if topic == RECORD_TOPIC => self.take_record(record),
-            [topic, header, picture] if topic == FRAME_TOPIC => self.take_picture(header, picture),
+            [topic, header, picture] if topic == FRAME_TOPIC => self.take_picture(header, picture).await,
             _ => Err(format!("a message of {} parts; accepted: frame (3 parts) and record (2 parts)", parts.len())),
         };
         let mut health = lock(&self.health);
@@ -263,27 +264,41 @@ impl Hub {
         Ok(())
     }
 
-    fn take_picture(&self, header: &[u8], picture: &[u8]) -> Result<(), String> {
+    async fn take_picture(&self, given: &Bytes, picture: &Bytes) -> Result<(), String> {
         #[derive(Deserialize)]
         struct Protocol {
             protocol: u32,
         }
-        let (header, Protocol { protocol }) = checked(header)?;
+        let (header, Protocol { protocol }) = checked(given)?;
         if protocol != PROTOCOL {
             return Err(format!("the publisher speaks protocol {protocol}; accepted: {PROTOCOL}"));
         }
         let (_, Head { encoding, payload_bytes }) = checked(header.as_bytes())?;
-        if !["jpeg", "png"].contains(&encoding.as_str()) {
-            return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg and png (publish.payload)"));
+        if !["jpeg", "png", "exr"].contains(&encoding.as_str()) {
+            return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg, png and exr (publish.payload)"));
         }
+        if payload_bytes != picture.len() {
+            return Err(format!("a picture of {} bytes, of which its header says {payload_bytes}", picture.len()));
+        }
+        if encoding != "exr" {
+            self.pixels.receive(None);
+            return self.show(header, picture);
+        }
+        let (given, picture) = (given.clone(), picture.clone());
+        let decoded = tokio::task::spawn_blocking(move || decode(&given, &picture)).await.map_err(|error| error.to_string())?;
+        let Received { header, jpeg, frame } = decoded?;
+        self.show(&header, &jpeg)?;
+        self.pixels.receive(Some(frame));
+        Ok(())
+    }
+
+    /// Shows a picture that browsers know.
+    fn show(&self, header: &str, picture: &[u8]) -> Result<(), String> {
         if picture.len() > MAX_PICTURE_BYTES {
             return Err(format!(
                 "a picture of {} bytes; shown are up to {MAX_PICTURE_BYTES} (publish.payload = \"jpeg\" is smaller)",
                 picture.len()
             ));
-        }
-        if payload_bytes != picture.len() {
-            return Err(format!("a picture of {} bytes, of which its header says {payload_bytes}", picture.len()));
         }
         self.picture.send_modify(|newest| {
             let sequence = newest.as_ref().map_or(1, |newest| newest.sequence + 1);
@@ -386,7 +401,7 @@ impl Records {
 }
 
 /// Text that is JSON of this form, and what it says.
-fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str, T), String> {
+pub(super) fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str, T), String> {
     if json.len() > MAX_JSON_BYTES {
         return Err(format!("JSON of {} bytes; accepted: {MAX_JSON_BYTES}", json.len()));
     }

@@ -15,6 +15,7 @@ mod hub;
 mod metrics;
 mod pixels;
 mod planes;
+mod received;
 mod server;
 mod steering;
 mod token;
@@ -57,7 +58,8 @@ pub struct DashboardSettings {
     pub token: Token,
     /// Connection file of the run's command socket; `None`: pages only watch.
     pub steer: Option<PathBuf>,
-    /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own.
+    /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own, which serves those that are
+    /// published with all layers.
     pub newest: Option<Arc<NewestFrame>>,
     /// Chart of speed against accuracy, as SVG.
     pub chart: Option<Vec<u8>>,

@@ -4,6 +4,7 @@ use super::access::parameter;
 use super::field::Fields;
 use super::planes::MAX_PLANES;
 use crate::publish::{NewestFrame, NoField, NoFrame, channels_at, encode_exr, no_error, png};
+use crate::render::Film;
 use crate::run::Frame;
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -11,7 +12,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use serde::Serialize;
 use serde_json::{Map, Value};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
 
 /// Maximum number of pixels of a picture that is encoded here: an EXR of some 700 MB before compression.
@@ -21,7 +22,10 @@ const MAX_DOWNLOADS: usize = 1;
 /// Lossless pictures on their way at once, most of them the same one.
 const MAX_PICTURES: usize = 64;
 
-pub(super) const ELSEWHERE: &str = "this dashboard runs beside the run; with --dashboard the run serves them";
+pub(super) const ELSEWHERE: &str =
+    "this dashboard runs beside the run; with --dashboard the run serves them, and publish.payload = \"exr\" sends them";
+/// Of what is never sent.
+pub(super) const NOT_SENT: &str = "this dashboard runs beside the run; with --dashboard the run serves it";
 
 /// What is served of the pixels, as a page is told.
 #[derive(Debug, Serialize)]
@@ -33,13 +37,15 @@ pub(super) enum Kept<'a> {
     None(&'static str),
 }
 
-/// Serves the newest frame, if it is in this process.
+/// Serves the newest frame: of the run in this process, or as it was received with all layers.
 #[derive(Debug)]
 pub(super) struct Pixels {
-    pub(super) newest: Option<Arc<NewestFrame>>,
+    pub(super) newest: Arc<NewestFrame>,
+    /// The run is another process.
+    is_beside: bool,
     pub(super) downloads: Arc<Semaphore>,
     /// The latest picture that was encoded without loss, for all pages that ask for it.
-    lossless: Mutex<Option<(u64, Bytes)>>,
+    lossless: Mutex<Option<(Weak<Film>, Bytes)>>,
     pictures: Arc<Semaphore>,
     pub(super) planes: Arc<Semaphore>,
     pub(super) fields: Arc<Fields>,
@@ -106,20 +112,34 @@ impl File {
 impl Pixels {
     pub fn new(newest: Option<Arc<NewestFrame>>) -> Self {
         let [downloads, pictures, planes] = [MAX_DOWNLOADS, MAX_PICTURES, MAX_PLANES].map(|most| Arc::new(Semaphore::new(most)));
-        Self { newest, downloads, lossless: Mutex::default(), pictures, planes, fields: Arc::default() }
+        let is_beside = newest.is_none();
+        let newest = newest.unwrap_or_else(|| Arc::new(NewestFrame::received()));
+        Self { newest, is_beside, downloads, lossless: Mutex::default(), pictures, planes, fields: Arc::default() }
     }
 
     pub fn kept(&self) -> Kept<'_> {
-        self.newest.as_ref().map_or(Kept::None(ELSEWHERE), |newest| Kept::Ready(newest.run()))
+        if self.is_beside && self.newest.get(None).is_err() { Kept::None(ELSEWHERE) } else { Kept::Ready(self.newest.run()) }
+    }
+
+    /// Whether the run is another process.
+    pub fn is_beside(&self) -> bool {
+        self.is_beside
+    }
+
+    /// Takes a frame of a run in another process, or that it came without its layers.
+    pub fn receive(&self, frame: Option<Frame>) {
+        if self.is_beside {
+            self.newest.set(frame);
+        }
     }
 
     /// The frame that a query asks for by its number, or the newest one, and the name of its run.
     pub(super) fn frame(&self, uri: &Uri) -> Result<(Frame, &str), Refusal> {
-        let newest = self.newest.as_ref().ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned()))?;
         let wanted =
             parameter(uri, "frame").map(|text| whole("frame", text, "the number of a frame, or none for the newest")).transpose()?;
-        match newest.get(wanted) {
-            Ok(frame) => Ok((frame, newest.run())),
+        match self.newest.get(wanted) {
+            Ok(frame) => Ok((frame, self.newest.run())),
+            Err(NoFrame::NotYet) if self.is_beside => Err((StatusCode::NOT_FOUND, ELSEWHERE.to_owned())),
             Err(NoFrame::NotYet) => Err((StatusCode::NOT_FOUND, "no frame is complete yet".to_owned())),
             Err(NoFrame::MovedOn { wanted, kept }) => {
                 Err((StatusCode::GONE, format!("frame {wanted} is no longer kept: the run keeps its newest one, {kept} by now")))
@@ -174,8 +194,8 @@ impl Pixels {
     }
 
     async fn encode(&self, file: File, frame: &Frame) -> Result<Bytes, Refusal> {
-        let (frame, newest) = (frame.clone(), self.newest.clone());
-        let encode = move || newest.ok_or((StatusCode::NOT_FOUND, ELSEWHERE.to_owned())).and_then(|newest| file.encode(&frame, &newest));
+        let (frame, newest) = (frame.clone(), Arc::clone(&self.newest));
+        let encode = move || file.encode(&frame, &newest);
         let failed = |error: tokio::task::JoinError| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string());
         Ok(tokio::task::spawn_blocking(encode).await.map_err(failed)??.into())
     }
@@ -183,11 +203,11 @@ impl Pixels {
     /// The picture without loss. It is encoded once, whoever asks: idle pages all do.
     async fn lossless(&self, frame: &Frame) -> Result<Bytes, Refusal> {
         let mut latest = self.lossless.lock().await;
-        if let Some((_, bytes)) = latest.as_ref().filter(|(number, _)| *number == frame.record.frame) {
+        if let Some((_, bytes)) = latest.as_ref().filter(|(film, _)| std::ptr::eq(film.as_ptr(), Arc::as_ptr(&frame.film))) {
             return Ok(bytes.clone());
         }
         let bytes = self.encode(File::Png, frame).await?;
-        *latest = Some((frame.record.frame, bytes.clone()));
+        *latest = Some((Arc::downgrade(&frame.film), bytes.clone()));
         Ok(bytes)
     }
 

@@ -2,7 +2,7 @@
 
 use super::access::parameter;
 use super::hub::message;
-use super::pixels::{Pixels, Refusal, Sent, bad, refused};
+use super::pixels::{NOT_SENT, Pixels, Refusal, Sent, bad, refused};
 use crate::publish::{Layer, histogram, plane};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::{StatusCode, Uri};
@@ -35,7 +35,10 @@ impl Pixels {
         let name = parameter(uri, "of").unwrap_or_default();
         let layer = Layer::named(name).ok_or_else(|| bad("of", name, Layer::NAMES))?;
         // What cannot be met does not wait.
-        self.frame(uri)?;
+        let (frame, _) = self.frame(uri)?;
+        if layer == Layer::Trusted && frame.gate.is_none() && self.is_beside() {
+            return Err((StatusCode::NOT_FOUND, NOT_SENT.to_owned()));
+        }
         let busy = || (StatusCode::SERVICE_UNAVAILABLE, "other planes are on their way: try again in some seconds".to_owned());
         let permit = timeout(PLANE_WAIT, Arc::clone(&self.planes).acquire_owned()).await.map_err(|_| busy())?.map_err(|_| busy())?;
         // By now it may be a later one.

@@ -98,6 +98,17 @@ pub fn read_exr(path: &Path) -> std::result::Result<Film, PublishError> {
     decode_exr(&bytes).map_err(problem)
 }
 
+/// Samples that the parts of an EXR file claim in all, and whether each part has this width and height. Nothing is decoded.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn exr_claims(bytes: &[u8], size: [usize; 2]) -> std::result::Result<(usize, bool), String> {
+    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(|e| format!("not a readable EXR file: {e}"))?;
+    let samples = |header: &exr::meta::header::Header| header.layer_size.area().saturating_mul(header.channels.list.len());
+    let all = meta.headers.iter().map(samples).fold(0, usize::saturating_add);
+    Ok((all, meta.headers.iter().all(|header| [header.layer_size.width(), header.layer_size.height()] == size)))
+}
+
 /// Decodes an EXR file; see [`read_exr`].
 ///
 /// # Errors

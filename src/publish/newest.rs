@@ -9,7 +9,8 @@ use std::sync::{Mutex, PoisonError};
 #[derive(Debug)]
 pub struct NewestFrame {
     run: String,
-    about: MapAbout,
+    /// `None`: unknown, of frames that were received.
+    about: Option<MapAbout>,
     frame: Mutex<Option<Frame>>,
     /// `None` if no slides are kept.
     slide: Option<NewestSlide>,
@@ -40,7 +41,12 @@ impl NewestFrame {
         let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         // What every file system and a quoted string of HTTP accept.
         let run: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
-        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about, frame: Mutex::default(), slide: None }
+        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about: Some(about), frame: Mutex::default(), slide: None }
+    }
+
+    /// Of frames that another process publishes, with all their layers.
+    pub fn received() -> Self {
+        Self { run: "run".to_owned(), about: None, frame: Mutex::default(), slide: None }
     }
 
     /// Name of the run in names of files: letters, digits, `-`, `_` and `.`.
@@ -53,7 +59,8 @@ impl NewestFrame {
     /// # Errors
     /// Why it is no such field, or what the system refuses.
     pub fn netcdf(&self, frame: &Frame) -> Result<Vec<u8>, NoField> {
-        map_netcdf(frame, &self.about, &self.run)
+        let unknown = || NoField::Missing("only the run knows what its coordinates mean: with --dashboard it serves the file".to_owned());
+        map_netcdf(frame, self.about.as_ref().ok_or_else(unknown)?, &self.run)
     }
 
     /// The slide of the newest frame; `None` if no slides are kept.
@@ -63,7 +70,12 @@ impl NewestFrame {
 
     /// Keeps this frame in place of the one before.
     pub fn put(&self, frame: Frame) {
-        let before = self.lock().replace(frame);
+        self.set(Some(frame));
+    }
+
+    /// Keeps this frame, or none.
+    pub fn set(&self, frame: Option<Frame>) {
+        let before = std::mem::replace(&mut *self.lock(), frame);
         // A large picture is given back to the system without the lock.
         drop(before);
     }

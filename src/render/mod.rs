@@ -35,7 +35,7 @@ pub use light::Light;
 pub use majorant::{CellObservations, MajorantGrid};
 pub use map_picture::{MAP_TONE, MapPicture, footprint, map_radiance, viridis};
 pub use parameters::FrameParameters;
-pub use renderer::{FrameSetup, RenderStats, Renderer};
+pub use renderer::{FrameSetup, RenderStats, Renderer, check_depth};
 pub use scene::Scene;
 pub use settings::MAX_FRAMES_UNTIL;
 pub use settings::MAX_SAMPLES;

@@ -75,6 +75,19 @@ pub struct Renderer {
     wave_flights: usize,
 }
 
+/// Checks a full extinction in a box with these edges, in scene units.
+///
+/// # Errors
+/// f32 does not resolve the distance between tentative collisions, and a flight might never end.
+pub fn check_depth(extinction: f64, edges: [f64; 3]) -> Result<(), RenderError> {
+    require(
+        extinction * length(edges) <= 1e5,
+        "transfer.extinction",
+        extinction,
+        "at most an optical depth of 100000 over the box's diagonal",
+    )
+}
+
 impl Renderer {
     /// A renderer for FTLE = s / `tau` over `domain`. Checks everything in the scene.
     ///
@@ -87,10 +100,7 @@ impl Renderer {
         let light = Light::new(&scene.light)?;
         let edges = scene.edges(domain);
         let transfer = Transfer::new(&scene.transfer, edges.into_iter().fold(f64::INFINITY, f64::min))?;
-        // Beyond this depth f32 does not resolve the distance between tentative collisions, and a flight might never end.
-        let depth = f64::from(transfer.extinction_max()) * length(edges);
-        let deep = "at most an optical depth of 100000 over the box's diagonal";
-        require(depth <= 1e5, "transfer.extinction", transfer.extinction_max(), deep)?;
+        check_depth(f64::from(transfer.extinction_max()), edges)?;
         let cells = scene.settings.majorant_cells.unwrap_or_else(|| MajorantGrid::default_cells(domain, scene.scale));
         let space = SceneBox::new(domain, scene.scale, cells);
         let majorants = MajorantGrid::new(cells, &transfer);

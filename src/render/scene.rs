@@ -49,7 +49,7 @@ impl Scene {
     }
 
     /// Edges of the box, in scene units.
-    pub(super) fn edges(&self, domain: &Domain) -> [f64; 3] {
+    pub fn edges(&self, domain: &Domain) -> [f64; 3] {
         let extent = domain.extent();
         std::array::from_fn(|k| extent[k] * self.scale[k])
     }

@@ -49,7 +49,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             self.trace_from(slides, slide, former)?;
             // Colours and tolerance may have come with it.
-            if self.look_at_steps(slide)? {
+            if self.look_at_steps(slide)? || self.settle_storage(slide, false)? {
                 with!(&mut self.session, on => on.tracer = None);
                 self.trace_anew(slide)?;
             }
@@ -63,7 +63,7 @@ impl<B: Backend> Cycle<'_, B> {
         let report = &mut self.run.report;
         (report.integration_difference, report.integration_residual) = (None, None);
         report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));
-        Decision::withdraw(&mut report.decisions, &["flow.steps", "device.storage"]);
+        Decision::withdraw(&mut report.decisions, &["flow.steps"]);
         if self.map.tau != former_tau {
             Decision::withdraw(&mut report.decisions, &["time.tau"]);
         }
@@ -92,7 +92,7 @@ impl<B: Backend> Cycle<'_, B> {
         let mut scene = self.run.renderer.scene().clone();
         if !self.run.has_range {
             let plan = self.run.plan;
-            let albedo = scene.transfer.albedo.clone();
+            let TransferSettings { extinction, albedo, .. } = scene.transfer.clone();
             scene.transfer = loop {
                 let (stop, method) = (self.run.stop, self.run.render.method);
                 let settled = with!(&self.session, on => {
@@ -106,7 +106,8 @@ impl<B: Backend> Cycle<'_, B> {
                     settled => break settled?,
                 }
             };
-            scene.transfer = TransferSettings { extinction: self.run.extinction.or(scene.transfer.extinction), albedo, ..scene.transfer };
+            // Those of the scene, or of a command.
+            scene.transfer = TransferSettings { extinction, albedo, ..scene.transfer };
         }
         let run = &mut self.run;
         let (plan, tau) = (run.plan, self.map.tau);

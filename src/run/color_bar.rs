@@ -53,7 +53,8 @@ impl ColorBar {
         let mut scene = Scene { camera: camera.clone(), scale: record.scale, ..assemble(settings, &domain) };
         [scene.settings.width, scene.settings.height] = record.size;
         let (low, high, extinction) = (Some(transfer.low), Some(transfer.high), Some(transfer.extinction));
-        scene.transfer = TransferSettings { low, high, extinction, ..scene.transfer };
+        let albedo = record.albedo.clone().unwrap_or(scene.transfer.albedo);
+        scene.transfer = TransferSettings { low, high, extinction, albedo };
         let renderer = Renderer::new(scene, &domain, record.tau).map_err(|error| format!("does not fit the scene: {error}"))?;
         let method = if record.method == Method::Map.name() { Method::Map } else { Method::Reference };
         Ok(Self::new(&renderer, method, [transfer.low, transfer.high], &record.time_unit))

@@ -11,7 +11,7 @@ use crate::render::RenderError;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Commands {
     None,
-    /// The camera, or whether the window stands still.
+    /// Camera, extinction or albedo, or whether the window stands still.
     View,
     /// The method: the picture begins anew.
     Method,
@@ -78,7 +78,7 @@ impl Run<'_> {
             self.learning.trust.reset();
         }
         self.has_range |= set.range.is_some();
-        self.extinction = set.extinction.or(self.extinction);
+        self.albedo = set.albedo.clone().or(self.albedo.take());
         // The flow map follows once all commands are applied.
         self.asked = asked(&self.plan.map, &self.asked, set);
         if set.method.is_some() || set.budget.is_some() {

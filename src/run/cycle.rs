@@ -26,6 +26,7 @@ use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::progress;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
+use crate::source::SourceKind;
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
@@ -35,10 +36,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
-
-/// What is said of a window that is flat.
-const FLAT: &str = "all levels of the first window have the same velocity, and none crosses them: one of them (archive.level) gives the same FTLE, \
-                    unless it is negative, for less";
 
 /// Options of a run besides its scene.
 #[derive(Debug, Clone, Default)]
@@ -140,6 +137,8 @@ pub struct RunReport {
 const TWO_A_PIXEL: &str = "two a pixel along the longest edge, since the FTLE of a flow of two dimensions folds finer than data";
 /// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
 const COARSE_IN_TIME: f64 = 0.25;
+/// The same share below which a message calls it fine in time: less than the steps of a grid may change the log-stretch.
+const FINE_IN_TIME: f64 = 0.01;
 /// Frames that refine a window that stands still, after each command.
 const FRAMES_WHILE_PAUSED: usize = 32;
 /// Interval at which a run that waits for a command looks for the end, and for the simulation.
@@ -168,8 +167,8 @@ pub(super) struct Run<'a> {
     pub(super) transfer: TransferRecord,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
-    /// Full extinction, if a command set it.
-    pub(super) extinction: Option<f64>,
+    /// Coefficients of the albedo, if a command set them.
+    pub(super) albedo: Option<[Vec<f64>; 3]>,
     pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
@@ -383,9 +382,13 @@ fn drive<B: Backend>(
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
     if let VelocitySource::Window(window) = &slide.velocity
-        && run.threads.render().install(|| window.is_flat())
+        && window.is_flat()
     {
-        sink(Event::Note(FLAT.into()));
+        let key = if plan.scene.source.kind == SourceKind::Archive { " (archive.level)" } else { "" };
+        sink(Event::Note(format!(
+            "all levels of the first window have the same velocity, and none crosses them: one of them{key} gives the same FTLE, unless it is negative, \
+             for less"
+        )));
     }
     let mut cycle = Cycle { run, session, map, frames_before: 0, settled: None, compared: None };
     if let Some(chosen) = chosen {
@@ -542,7 +545,7 @@ impl<'a> Run<'a> {
             render,
             transfer,
             has_range: false,
-            extinction: None,
+            albedo: None,
             color_bar,
             learning,
             progress,
@@ -566,7 +569,7 @@ impl<B: Backend> Cycle<'_, B> {
             self.take_steps(chosen, Some(settled));
             transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         }
-        self.settle_storage(slide)?;
+        self.settle_storage(slide, true)?;
         Ok(())
     }
 
@@ -626,7 +629,7 @@ impl<B: Backend> Cycle<'_, B> {
 
     /// Renders all slides. The preparation of the first one began at `begun`.
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
-        self.prepare_first(&mut slide)?;
+        self.prepare_first(&mut slide, sink)?;
         loop {
             self.frames(slides, &mut slide, begun, sink)?;
             // Tracer and slide both hold the window, on the host and on the device.
@@ -649,7 +652,7 @@ impl<B: Backend> Cycle<'_, B> {
         }
     }
 
-    fn prepare_first(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
+    fn prepare_first(&mut self, slide: &mut Slide, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         if self.run.keeps_surrogate() {
             transaction!(self, slide, run, on => run.build_surrogate(on));
         }
@@ -679,6 +682,12 @@ impl<B: Backend> Cycle<'_, B> {
                     100.0 * change / resolution.ftle_rms
                 ));
             }
+            if let Some(change) = resolution.ftle_change.filter(|change| *change < FINE_IN_TIME * resolution.ftle_rms) {
+                sink(Event::Note(format!(
+                    "fine in time: without every second snapshot the FTLE changes by {:.2} % of its root mean square; half of the snapshots would do",
+                    100.0 * change / resolution.ftle_rms
+                )));
+            }
             self.run.report.time_resolution = Some(resolution);
         }
         slide.warnings.extend(self.run.beyond_the_range(slide.time));
@@ -699,7 +708,7 @@ impl<B: Backend> Cycle<'_, B> {
     /// Makes the flow map of a slide, and all that was traced by the one before.
     pub(super) fn trace_anew(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
-        self.settle_storage(slide)?;
+        self.settle_storage(slide, false)?;
         self.run.learning.peak = f32::NEG_INFINITY;
         self.run.progress.lacks_room_for_nodes = false;
         let rebuilds = self.run.learning.resize.is_some();
@@ -741,7 +750,7 @@ impl<B: Backend> Cycle<'_, B> {
             let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
             if commands == Commands::Map {
                 self.take_map(slides, slide)?;
-            } else if commands == Commands::Colours && (self.look_at_steps(slide)? || self.settle_storage(slide)?) {
+            } else if commands == Commands::Colours && (self.look_at_steps(slide)? || self.settle_storage(slide, false)?) {
                 with!(&mut self.session, on => {
                     on.tracer = None;
                     on.picture = Default::default();

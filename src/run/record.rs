@@ -31,6 +31,9 @@ pub struct FrameRecord {
     /// Transfer function of the picture.
     #[serde(default)]
     pub transfer: TransferRecord,
+    /// Polynomial coefficients of the albedo that a command set. `None`: those of the scene.
+    #[serde(default)]
+    pub albedo: Option<[Vec<f64>; 3]>,
     /// The view. `None` in records of earlier versions.
     #[serde(default)]
     pub camera: Option<CameraSettings>,

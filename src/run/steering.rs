@@ -4,7 +4,7 @@ use super::setup::{Plan, assemble};
 use super::slides::closed_form;
 use crate::field::Domain;
 use crate::flow::{Direction, Steps};
-use crate::render::{ALBEDO_PRESETS, Albedo, Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings};
+use crate::render::{ALBEDO_PRESETS, Albedo, Camera, CameraSettings, Method, RenderSettings, Transfer, TransferSettings, check_depth};
 use crate::setting::{Refused, require, shown};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
@@ -117,6 +117,8 @@ pub struct Steering {
     /// The view at the start.
     home: CameraSettings,
     aspect: f64,
+    /// Edges of the box, in scene units.
+    edges: [f64; 3],
     trust: TrustSettings,
     transfer: TransferSettings,
     /// As the run began.
@@ -158,8 +160,10 @@ impl Steering {
     pub fn new(plan: &Plan) -> Self {
         let scene = &plan.scene;
         let Domain { dimensions, .. } = plan.domain;
+        let assembled = assemble(scene, &plan.domain);
         Self {
-            home: assemble(scene, &plan.domain).camera,
+            edges: assembled.edges(&plan.domain),
+            home: assembled.camera,
             aspect: scene.render.aspect(),
             trust: scene.trust.clone(),
             transfer: scene.transfer.clone().unwrap_or_default(),
@@ -223,18 +227,19 @@ impl Steering {
                 }
                 "transfer" => {
                     let range: Range = read(key, value, "low and high, two numbers")?;
-                    self.check_transfer(TransferSettings { low: Some(range.low), high: Some(range.high), ..self.transfer.clone() })?;
+                    check_transfer(&TransferSettings { low: Some(range.low), high: Some(range.high), ..self.transfer.clone() })?;
                     change.range = Some(range);
                 }
                 "transfer.extinction" => {
                     let extinction = read(key, value, "a number from 0 up, per unit of length")?;
-                    self.check_transfer(TransferSettings { extinction: Some(extinction), ..any_range() })?;
+                    check_transfer(&TransferSettings { extinction: Some(extinction), ..any_range() })?;
+                    check_depth(extinction, self.edges).map_err(Refused::from)?;
                     change.extinction = Some(extinction);
                 }
                 "transfer.albedo" => {
                     let accepted = format!("{}, or three lists of coefficients", ALBEDO_PRESETS.join(", "));
                     let Albedo(albedo) = read(key, value, &accepted)?;
-                    self.check_transfer(TransferSettings { albedo: albedo.clone(), ..any_range() })?;
+                    check_transfer(&TransferSettings { albedo: albedo.clone(), ..any_range() })?;
                     change.albedo = Some(albedo);
                 }
                 "render.method" => {
@@ -267,10 +272,6 @@ impl Steering {
             RenderSettings { method, budget: Some(budget), ..self.render.clone() }.check().map_err(Refused::from)?;
         }
         Ok(change)
-    }
-
-    fn check_transfer(&self, settings: TransferSettings) -> Result<(), Refused> {
-        Transfer::new(&settings, 1.0).map(|_| ()).map_err(Refused::from)
     }
 
     /// A duration that the window holds.
@@ -366,12 +367,16 @@ pub(super) fn drawn_by(render: &RenderSettings, method: Method, budget: Option<f
     RenderSettings { method, budget, until, ..render.clone() }
 }
 
-/// Reads a value; a fault names the key inside it.
 /// A transfer function for what does not depend on its range.
 fn any_range() -> TransferSettings {
     TransferSettings { low: Some(0.0), high: Some(1.0), ..TransferSettings::default() }
 }
 
+fn check_transfer(settings: &TransferSettings) -> Result<(), Refused> {
+    Transfer::new(settings, 1.0).map(|_| ()).map_err(Refused::from)
+}
+
+/// Reads a value; a fault names the key inside it.
 fn read<'a, T: Deserialize<'a>>(key: &str, value: &'a Value, accepted: &str) -> Result<T, Refused> {
     serde_path_to_error::deserialize(value).map_err(|error| {
         let inner = error.path().to_string();
@@ -395,6 +400,7 @@ mod tests {
         Steering {
             home: CameraSettings { eye: [0.0, 0.0, 2.0], look_at: [0.0; 3], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true },
             aspect: 2.0,
+            edges: [2.0, 1.0, 0.2],
             trust: TrustSettings::default(),
             transfer: TransferSettings::default(),
             render: render.clone(),
@@ -434,6 +440,7 @@ mod tests {
             (json!({"transfer": {"low": 2, "high": 1}}), "`transfer.high` is 1.0"),
             (json!({"transfer": {"low": 2}}), "`transfer` cannot be read (missing field `high`)"),
             (json!({"transfer.extinction": -1}), "`transfer.extinction` is -1.0; accepted:"),
+            (json!({"transfer.extinction": 1e5}), "`transfer.extinction` is 100000.0; accepted: at most an optical depth of 100000 over"),
             (json!({"transfer.extinction": "thick"}), "`transfer.extinction` is \"thick\"; accepted: a number from 0 up"),
             (
                 json!({"transfer.albedo": "rainbow"}),

@@ -72,18 +72,21 @@ pub(super) struct PictureSteps {
 /// As for [`cpu_tracer`], or a stop is requested.
 pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<(PictureSteps, Option<Comparison>), RunEnd> {
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
-    let Some(comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
+    let Some(mut comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
         return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 }, None));
     };
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
         let found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
+        comparison.of_steps = found.residual;
         if found.residual <= shown.most() {
             return Ok((found, Some(comparison)));
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
     }
-    Ok((comparison.of(shown, slide, chosen.steps)?, Some(comparison)))
+    let found = comparison.of(shown, slide, chosen.steps)?;
+    comparison.of_steps = found.residual;
+    Ok((found, Some(comparison)))
 }
 
 /// Whether steps that were `settled` for an earlier slide suit the picture of this one no more: its flow, its colours or its tolerance may be others.
@@ -99,10 +102,11 @@ pub(super) fn is_outdated(
 ) -> Result<(bool, Option<Comparison>), RunEnd> {
     // A quarter of the points of a choice, and others on each slide.
     let cells = if shown.plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
-    let Some(comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok((false, None)) };
+    let Some(mut comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok((false, None)) };
     // Where the choice had no more steps to give, their residual may be larger.
     let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };
-    let share = comparison.of(shown, slide, settled.steps)?.residual / most;
+    comparison.of_steps = comparison.of(shown, slide, settled.steps)?.residual;
+    let share = comparison.of_steps / most;
     // Outside its tolerance a choice has no fewer steps to give either.
     let is_least = settled.steps <= chosen.multiple_of || !chosen.within_tolerance;
     Ok((share > *AGAIN.end() || share < *AGAIN.start() && !is_least, Some(comparison)))
@@ -118,6 +122,8 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
 pub(super) struct Comparison {
     pub(super) points: Vec<DomainPoint>,
     truth: Traced,
+    /// Optical residual of the steps that the picture takes, in double precision too.
+    pub(super) of_steps: f64,
 }
 
 impl Comparison {
@@ -132,7 +138,7 @@ impl Comparison {
         reference.trace(&points, Extras::default(), &mut truth);
         let seen = truth.log_stretch.iter().filter(|&&s| shown.ramp(s) > 0.0).count();
         let cells: usize = cells.iter().product();
-        Ok(Some(Self { points, truth }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
+        Ok(Some(Self { points, truth, of_steps: 0.0 }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
     }
 
     fn of(&self, shown: Shown<'_>, slide: &Slide, steps: usize) -> Result<PictureSteps, RunEnd> {

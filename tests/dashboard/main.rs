@@ -391,7 +391,8 @@ fn messages_that_are_not_understood_are_told_and_cost_nothing() {
     let good = header("frame", json!(1));
     for (parts, hint) in [
         (vec![b"frame".to_vec(), header("protocol", json!(4))], "protocol 4; accepted: 3"),
-        (vec![b"frame".to_vec(), header("encoding", json!("exr"))], "as exr; shown are jpeg and png"),
+        (vec![b"frame".to_vec(), header("encoding", json!("raw"))], "as raw; shown are jpeg, png and exr"),
+        (vec![b"frame".to_vec(), header("encoding", json!("exr"))], "not understood"),
         (vec![b"frame".to_vec(), header("payload_bytes", json!(4))], "of 3 bytes, of which its header says 4"),
         (vec![b"frame".to_vec(), b"{".to_vec()], "not understood"),
         (vec![b"frame".to_vec(), b"{\"protocol\":3}".to_vec()], "not understood"),

@@ -4,10 +4,13 @@ use crate::kit::program::{Running, ridgewatch, run, set, start, text, until};
 use crate::kit::publishing;
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, ask, get};
-use crate::{LIMIT, Stage};
-use ridgewatch::publish::{MapAbout, NewestFrame, NewestSlide, NoField, channels_at, decode_exr, png, read_exr};
+use crate::{LIMIT, Stage, raw_publisher};
+use ridgewatch::publish::{
+    FrameHeader, MapAbout, NewestFrame, NewestSlide, NoField, Payload, channels_at, decode_exr, encode_exr, jpeg, png, read_exr,
+};
 use ridgewatch::render::{CameraSettings, Film};
 use ridgewatch::run::{ColorBar, DomainRecord, Frame, FrameRecord, ShownSlide};
+use ridgewatch_zmtp::Keep;
 use serde_json::{Value, json};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -203,6 +206,86 @@ fn a_map_is_a_field_on_axes() {
     newest.put(frame(6, film));
     let (status, answer) = get(address, &format!("/frame.nc?token={token}"), &[]);
     assert!(status == 404 && answer.contains("a picture of a volume"), "{answer}");
+}
+
+/// A dashboard that is a process of its own has what the run publishes.
+#[test]
+fn frames_that_are_published_with_all_layers_are_served() {
+    let stage = Stage::new();
+    let (address, token) = (stage.address(), &stage.token);
+    let mut visitor = stage.visit();
+    let publisher = raw_publisher(&stage, &mut visitor);
+    let (status, answer) = get(address, &format!("/values?x=0&y=0&token={token}"), &[]);
+    assert!(status == 404 && answer.contains("publish.payload = \"exr\" sends them"), "{answer}");
+    let sent = frame(12, film([9, 4], true));
+    let exr = encode_exr(&sent.film, Some(&sent.record)).unwrap();
+    let header = FrameHeader {
+        protocol: 3,
+        frame: 12,
+        encoding: Payload::Exr,
+        shape: [4, 9, 4],
+        dtype: "float32".into(),
+        payload_bytes: exr.len(),
+        tone_map: sent.tone_map,
+        color_bar: sent.color_bar.as_deref().cloned(),
+        record: (*sent.record).clone(),
+    };
+    let publish = |header: &FrameHeader, picture: &[u8]| {
+        let json = serde_json::to_vec(header).unwrap();
+        publisher.send(&[b"frame", &json], picture.to_vec(), Keep::All);
+    };
+    publish(&header, &exr);
+    let shown = visitor.frame();
+    assert_eq!(shown.payload, jpeg(&sent.film, sent.tone_map).unwrap(), "a browser gets what it can draw");
+    let told: FrameHeader = serde_json::from_value(shown.json["header"].clone()).unwrap();
+    assert_eq!((told.encoding, told.shape, told.payload_bytes), (Payload::Jpeg, [4, 9, 3], shown.payload.len()));
+    assert_eq!((&told.record, &told.color_bar), (&header.record, &header.color_bar));
+    visitor.until_state(|state| state["values"]["ready"] == "run");
+    for (x, y) in (0..36).map(|pixel| (pixel % 9, pixel / 9)) {
+        let (status, answer) = get(address, &format!("/values?token={token}&x={x}&y={y}"), &[]);
+        assert_eq!(status, 200, "{answer}");
+        agrees(&serde_json::from_str(body(&answer)).unwrap(), &sent.film);
+    }
+    let (head, file) = bytes(address, &format!("/frame.exr?token={token}"));
+    assert!(head.contains("run-frame-000012-slide-0002.exr"), "{head}");
+    let saved = decode_exr(&file).unwrap();
+    for pixel in (0..36).map(|pixel| [pixel % 9, pixel / 9]) {
+        let bits = |film: &Film| channels_at(film, pixel).into_iter().map(|(name, value)| (name, value.to_bits())).collect::<Vec<_>>();
+        assert_eq!(bits(&saved), bits(&sent.film), "{pixel:?}");
+    }
+    for (target, status, words) in [
+        ("/plane?of=error&", 200, ""),
+        ("/histogram?", 200, "counts"),
+        ("/plane?of=trusted&", 404, "with --dashboard the run serves it"),
+        ("/field.nc?", 404, "with --dashboard the run serves it"),
+        ("/frame.nc?", 404, "only the run knows"),
+    ] {
+        let (found, answer) = get(address, &format!("{target}token={token}"), &[]);
+        assert!(found == status && answer.contains(words), "{target} {answer}");
+    }
+    // What is no picture is told, and the one before stays.
+    let half = &exr[..exr.len() / 2];
+    publish(&FrameHeader { payload_bytes: half.len(), ..header.clone() }, half);
+    visitor.until_state(|state| state["problem"].as_str().is_some_and(|problem| problem.contains("not a readable EXR file")));
+    publish(&FrameHeader { shape: [9, 4, 4], ..header.clone() }, &exr);
+    visitor.until_state(|state| {
+        state["problem"].as_str().is_some_and(|problem| problem.contains("of another size than its header says, 4 x 9"))
+    });
+    assert_eq!(get(address, &format!("/values?token={token}&x=0&y=0&frame=12"), &[]).0, 200);
+    let picture = || bytes(address, &format!("/frame.png?token={token}")).1;
+    assert_eq!(picture(), png(&decode_exr(&exr).unwrap(), sent.tone_map).unwrap());
+    // The next run begins with the same numbers, and has another picture.
+    let other = Film { rgba: vec![[0.25, 0.5, 0.75, 1.0]; 36], ..film([9, 4], true) };
+    let exr = encode_exr(&other, Some(&sent.record)).unwrap();
+    publish(&FrameHeader { payload_bytes: exr.len(), ..header.clone() }, &exr);
+    visitor.frame();
+    until("its picture", || picture() == png(&other, sent.tone_map).unwrap());
+    // And one after it publishes no layers.
+    let plain = FrameHeader { encoding: Payload::Jpeg, payload_bytes: 3, ..header.clone() };
+    publish(&plain, b"abc");
+    assert_eq!(visitor.frame().payload, b"abc");
+    visitor.until_state(|state| state["values"]["none"].is_string());
+    assert_eq!(get(address, &format!("/frame.exr?token={token}"), &[]).0, 404);
 }
 
 #[test]

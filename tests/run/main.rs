@@ -13,6 +13,7 @@ mod messages;
 mod movie;
 #[path = "../network_support/mod.rs"]
 mod network_support;
+mod notes;
 mod race;
 mod refine;
 mod scene_file;

@@ -3,7 +3,7 @@
 use crate::kit;
 use crate::kit::program::{ridgewatch, set, start, text, until};
 use crate::kit::scene::{double_gyre, run_frames, setup, write};
-use ridgewatch::run::{Event, Frame, RunOptions, RunReport, Setup, Steering, run};
+use ridgewatch::run::{ColorBar, Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, HashSet};
@@ -75,7 +75,9 @@ fn a_command_is_in_effect_and_in_the_record_of_the_next_frame() {
 #[test]
 fn extinction_and_albedo_are_those_of_the_latest_command() {
     let keys = "time.frames_per_slide = 6\nrender.method = \"two_level\"\n";
-    let (frames, _) = steered(scene(keys), |steering, frame| {
+    let setup = scene(keys);
+    let settings = setup.plan.scene.clone();
+    let (frames, _) = steered(setup, |steering, frame| {
         match frame.record.frame {
             0 => command(steering, json!({"transfer.extinction": 2.5})),
             2 => command(steering, json!({"transfer.albedo": "deep"})),
@@ -90,6 +92,10 @@ fn extinction_and_albedo_are_those_of_the_latest_command() {
     assert!(transfer[..5].iter().all(|t| t.low == transfer[0].low) && transfer[5].low != transfer[0].low, "{transfer:?}");
     let bar = |frame: usize| &frames[frame].color_bar.as_ref().unwrap().colors;
     assert!(bar(0) != bar(1) && bar(1) == bar(2) && bar(2) != bar(3) && bar(3) == bar(5));
+    // A figure of the run has these colours too: the record tells them.
+    for frame in &frames {
+        assert_eq!(Some(ColorBar::of(&settings, &frame.record).unwrap()), frame.color_bar.as_deref().cloned(), "{}", frame.record.frame);
+    }
     assert!(frames[1].film.rgba[..] != frames[0].film.rgba[..] && frames[3].film.rgba[..] != frames[2].film.rgba[..]);
     // Thinner, the picture lets more of the background through.
     let opacity = |frame: usize| frames[frame].film.rgba.iter().map(|pixel| f64::from(pixel[3])).sum::<f64>();

@@ -73,7 +73,7 @@ impl SeedField {
     }
 }
 
-/// The slide that a run shows, for those who want its field. The run alone decides how long its window is kept.
+/// The slide that a run shows, for those who want its field. Its window is kept as long as the run has it, or somebody waits for it.
 #[derive(Debug)]
 pub struct NewestSlide {
     plan: Plan,
@@ -116,7 +116,9 @@ impl NewestSlide {
         let plan = Plan { map: asked.clone(), ..self.plan.clone() };
         let mut state = self.lock();
         let velocity = match &slide.velocity {
-            VelocitySource::Window(window) if state.asked.is_none_or(|asked| asked.elapsed() > ASKED_FOR) => {
+            VelocitySource::Window(window)
+                if state.asked.is_none_or(|asked| asked.elapsed() > ASKED_FOR) || check_room(window).is_err() =>
+            {
                 KeptVelocity::Borrowed(Arc::downgrade(window))
             }
             velocity => KeptVelocity::Owned(velocity.clone()),
@@ -156,15 +158,7 @@ impl NewestSlide {
         state.asked = None;
         if let VelocitySource::Window(window) = &velocity {
             kept.velocity = KeptVelocity::Borrowed(Arc::downgrade(window));
-            if let Some(free) = available()
-                && window.bytes() as u64 > free / 2
-            {
-                let (window, free) = (gib(window.bytes() as u64), gib(free));
-                let why = format!(
-                    "its window may have to be kept beside those of the run: {window:.2} GiB, and {free:.2} GiB are free; accepted: half"
-                );
-                return Err(NoField::NoRoom(why));
-            }
+            check_room(window)?;
         }
         let slide = Slide { index, time: kept.time, date: kept.date.clone(), live: None, velocity, warnings: Vec::new(), waited: 0.0 };
         Ok(Some(SlideField { plan: kept.plan.clone(), slide }))
@@ -172,6 +166,20 @@ impl NewestSlide {
 
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Checks that a window can be kept beside those of the run.
+fn check_room(window: &Window) -> Result<(), NoField> {
+    match available() {
+        Some(free) if window.bytes() as u64 > free / 2 => {
+            let (window, free) = (gib(window.bytes() as u64), gib(free));
+            let why = format!(
+                "its window may have to be kept beside those of the run: {window:.2} GiB, and {free:.2} GiB are free; accepted: half"
+            );
+            Err(NoField::NoRoom(why))
+        }
+        _ => Ok(()),
     }
 }
 
