@@ -22,10 +22,9 @@ const MAX_DOWNLOADS: usize = 1;
 /// Lossless pictures on their way at once, most of them the same one.
 const MAX_PICTURES: usize = 64;
 
-pub(super) const ELSEWHERE: &str =
-    "this dashboard runs beside the run; with --dashboard the run serves them, and publish.payload = \"exr\" sends them";
+pub(super) const ELSEWHERE: &str = "only a run with --dashboard, or publish.payload = \"exr\", has them";
 /// Of what is never sent.
-pub(super) const NOT_SENT: &str = "this dashboard runs beside the run; with --dashboard the run serves it";
+pub(super) const NOT_SENT: &str = "only a run with --dashboard has it";
 
 /// What is served of the pixels, as a page is told.
 #[derive(Debug, Serialize)]

@@ -129,9 +129,9 @@ fn what_cannot_be_told_is_said_in_words() {
     // A process of its own has no frames, and its pages know before they ask.
     let alone = Stage::new();
     let state = alone.visit().until_state(|_| true);
-    assert!(state["values"]["none"].as_str().unwrap().contains("beside the run"), "{state}");
+    assert!(state["values"]["none"].as_str().unwrap().contains("only a run with --dashboard"), "{state}");
     let (status, answer) = get(alone.address(), &format!("/values?x=0&y=0&token={}", alone.token), &[]);
-    assert!(status == 404 && answer.contains("with --dashboard the run serves them"), "{answer}");
+    assert!(status == 404 && answer.contains("only a run with --dashboard"), "{answer}");
     assert_eq!(stage.visit().until_state(|_| true)["values"], json!({"ready": "gulf"}));
 }
 
@@ -216,7 +216,7 @@ fn frames_that_are_published_with_all_layers_are_served() {
     let mut visitor = stage.visit();
     let publisher = raw_publisher(&stage, &mut visitor);
     let (status, answer) = get(address, &format!("/values?x=0&y=0&token={token}"), &[]);
-    assert!(status == 404 && answer.contains("publish.payload = \"exr\" sends them"), "{answer}");
+    assert!(status == 404 && answer.contains("only a run with --dashboard, or publish.payload = \"exr\", has them"), "{answer}");
     let sent = frame(12, film([9, 4], true));
     let exr = encode_exr(&sent.film, Some(&sent.record)).unwrap();
     let header = FrameHeader {
@@ -256,8 +256,8 @@ fn frames_that_are_published_with_all_layers_are_served() {
     for (target, status, words) in [
         ("/plane?of=error&", 200, ""),
         ("/histogram?", 200, "counts"),
-        ("/plane?of=trusted&", 404, "with --dashboard the run serves it"),
-        ("/field.nc?", 404, "with --dashboard the run serves it"),
+        ("/plane?of=trusted&", 404, "only a run with --dashboard has it"),
+        ("/field.nc?", 404, "only a run with --dashboard has it"),
         ("/frame.nc?", 404, "only the run knows"),
     ] {
         let (found, answer) = get(address, &format!("{target}token={token}"), &[]);

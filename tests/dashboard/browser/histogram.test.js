@@ -155,7 +155,7 @@ test("a finger drags a handle", async () => {
 
 test("beside a run there is no histogram, and it is said", async () => {
   const page = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
-  await until("it is said", async () => (await page.textContent("#histogram-text")) === "No histogram here: this dashboard runs beside the run; with --dashboard the run serves them, and publish.payload = \"exr\" sends them.");
+  await until("it is said", async () => (await page.textContent("#histogram-text")) === "No histogram here: only a run with --dashboard, or publish.payload = \"exr\", has them.");
   assert.ok(!(await page.isVisible("#histogram-plot")));
   assert.deepEqual(complaints, []);
   await page.context().close();

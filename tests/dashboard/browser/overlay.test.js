@@ -150,7 +150,7 @@ test("of an earlier frame, of a method without an error and beside a run the pag
   await page.context().close();
   const other = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
   await other.keyboard.press("o");
-  await until("it is said", async () => (await text(other)) === "No overlay here: this dashboard runs beside the run; with --dashboard the run serves them, and publish.payload = \"exr\" sends them.");
+  await until("it is said", async () => (await text(other)) === "No overlay here: only a run with --dashboard, or publish.payload = \"exr\", has them.");
   assert.deepEqual(complaints, []);
   await other.context().close();
 });

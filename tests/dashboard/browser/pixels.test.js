@@ -158,7 +158,7 @@ test("the field of a slide is saved, and the command for it writes it too, at th
 
 test("a dashboard beside the run says that it has no values", async () => {
   const page = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
-  const why = /this dashboard runs beside the run; with --dashboard the run serves them/;
+  const why = /only a run with --dashboard, or publish.payload = "exr", has them/;
   await until("it is said", async () => why.test(await line(page)));
   assert.ok(await fits(page));
   await point(page, [5, 5]);
