@@ -253,7 +253,9 @@ fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[
         if panel.is_y_log {
             draw_panel(&plot, panel, log(x).log_scale(), log(y).log_scale())?;
         } else {
-            let margin = 0.05 * (y.end - y.start);
+            // One value alone has room as well.
+            let range = if y.end > y.start { y.end - y.start } else { y.end.abs().max(1e-3) };
+            let margin = 0.05 * range;
             draw_panel(&plot, panel, log(x).log_scale(), y.start - margin..y.end + margin)?;
         }
     }
@@ -290,8 +292,6 @@ where
     X::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
     Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
 {
-    let levels = span(panel, |(_, y)| y);
-    let is_fine = levels.end - levels.start < 10.0;
     let mut plot = ChartBuilder::on(area)
         .caption(&panel.title, (FONT, 20))
         .margin(12)
@@ -299,13 +299,15 @@ where
         .y_label_area_size(78)
         .build_cartesian_2d(x, y)
         .map_err(plot_error)?;
+    let height = plot.y_range().end - plot.y_range().start;
+    let decimals = (1.0 - height.log10().floor()).clamp(0.0, 6.0) as usize;
     plot.configure_mesh()
         .x_desc(&panel.x)
         .y_desc(&panel.y)
         .label_style((FONT, 15))
         .axis_desc_style((FONT, 17))
         .x_label_formatter(&power)
-        .y_label_formatter(&|y| if panel.is_y_log || is_fine { power(y) } else { format!("{y:.0}") })
+        .y_label_formatter(&|y| if panel.is_y_log { power(y) } else { format!("{y:.decimals$}") })
         .light_line_style(WHITE)
         .draw()
         .map_err(plot_error)?;

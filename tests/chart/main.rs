@@ -164,6 +164,9 @@ fn training_lowers_the_error_on_points_it_never_sees() {
     assert!(std::fs::read_to_string(out.join("epochs.svg")).unwrap().contains("<svg"));
     // Another training is drawn beside it, each by the name of its folder.
     let second = folder.path().join("second");
+    // A single epoch is a point.
+    let given = [&network[..], &["--epochs", "1", "--labels", "8192"]].concat();
+    run(&mut ridgewatch(command("train", &folder.path().join("single"), &given))).success();
     let given = [&network[..], &["--epochs", "2", "--labels", "8192", "--beside", text(&out)]].concat();
     run(&mut ridgewatch(command("train", &second, &given))).success();
     let drawn = std::fs::read_to_string(second.join("epochs.svg")).unwrap();
