@@ -53,9 +53,15 @@ impl Run<'_> {
         }
     }
 
+    /// Coefficients of the albedo, if a command set others than the scene's.
+    pub(super) fn steered_albedo(&self) -> Option<[Vec<f64>; 3]> {
+        let (own, now) = (self.plan.scene.transfer.clone().unwrap_or_default().albedo, &self.renderer.scene().transfer.albedo);
+        (*now != own).then(|| now.clone())
+    }
+
     fn apply(&mut self, Command { set, .. }: &Command) -> Result<(), RenderError> {
-        let has_colours = set.range.is_some() || set.extinction.is_some() || set.albedo.is_some();
-        if set.camera.is_some() || has_colours {
+        let has_transfer = set.range.is_some() || set.extinction.is_some() || set.albedo.is_some();
+        if set.camera.is_some() || has_transfer {
             let mut scene = self.renderer.scene().clone();
             scene.camera = set.camera.clone().unwrap_or(scene.camera);
             if let Some(Range { low, high }) = set.range {
@@ -66,7 +72,7 @@ impl Run<'_> {
             let renderer = &mut self.renderer;
             self.threads.render().install(|| renderer.set_scene(scene))?;
         }
-        if has_colours {
+        if has_transfer {
             let extinction = f64::from(self.renderer.transfer().extinction_max());
             let Range { low, high } = set.range.unwrap_or(Range { low: self.transfer.low, high: self.transfer.high });
             self.transfer = TransferRecord { low, high, extinction };
@@ -78,7 +84,6 @@ impl Run<'_> {
             self.learning.trust.reset();
         }
         self.has_range |= set.range.is_some();
-        self.albedo = set.albedo.clone().or(self.albedo.take());
         // The flow map follows once all commands are applied.
         self.asked = asked(&self.plan.map, &self.asked, set);
         if set.method.is_some() || set.budget.is_some() {

@@ -167,8 +167,6 @@ pub(super) struct Run<'a> {
     pub(super) transfer: TransferRecord,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
-    /// Coefficients of the albedo, if a command set them.
-    pub(super) albedo: Option<[Vec<f64>; 3]>,
     pub(super) color_bar: Arc<ColorBar>,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
@@ -545,7 +543,6 @@ impl<'a> Run<'a> {
             render,
             transfer,
             has_range: false,
-            albedo: None,
             color_bar,
             learning,
             progress,

@@ -380,7 +380,7 @@ impl Run<'_> {
             time_unit: self.plan.time_unit.clone(),
             source: self.plan.source.clone(),
             transfer: self.transfer,
-            albedo: self.albedo.clone(),
+            albedo: self.steered_albedo(),
             direction: self.asked.direction.name().into(),
             method: self.render.method.name().into(),
             device: on.backend.name(),
