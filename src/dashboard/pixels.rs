@@ -41,7 +41,7 @@ pub(super) enum Kept<'a> {
 pub(super) struct Pixels {
     pub(super) newest: Arc<NewestFrame>,
     /// The run is another process.
-    is_beside: bool,
+    pub(super) is_beside: bool,
     pub(super) downloads: Arc<Semaphore>,
     /// The latest picture that was encoded without loss, for all pages that ask for it.
     lossless: Mutex<Option<(Weak<Film>, Bytes)>>,
@@ -118,11 +118,6 @@ impl Pixels {
 
     pub fn kept(&self) -> Kept<'_> {
         if self.is_beside && self.newest.get(None).is_err() { Kept::None(ELSEWHERE) } else { Kept::Ready(self.newest.run()) }
-    }
-
-    /// Whether the run is another process.
-    pub fn is_beside(&self) -> bool {
-        self.is_beside
     }
 
     /// Takes a frame of a run in another process, or that it came without its layers.

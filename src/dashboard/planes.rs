@@ -36,7 +36,7 @@ impl Pixels {
         let layer = Layer::named(name).ok_or_else(|| bad("of", name, Layer::NAMES))?;
         // What cannot be met does not wait.
         let (frame, _) = self.frame(uri)?;
-        if layer == Layer::Trusted && frame.gate.is_none() && self.is_beside() {
+        if layer == Layer::Trusted && frame.gate.is_none() && self.is_beside {
             return Err((StatusCode::NOT_FOUND, NOT_SENT.to_owned()));
         }
         let busy = || (StatusCode::SERVICE_UNAVAILABLE, "other planes are on their way: try again in some seconds".to_owned());

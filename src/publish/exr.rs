@@ -4,6 +4,7 @@ use super::error::PublishError;
 use crate::files::write_whole;
 use crate::{render::Film, run::FrameRecord};
 use exr::meta::MetaData;
+use exr::meta::header::Header;
 use exr::prelude::*;
 use std::io::{Cursor, Read};
 use std::path::Path;
@@ -98,13 +99,21 @@ pub fn read_exr(path: &Path) -> std::result::Result<Film, PublishError> {
     decode_exr(&bytes).map_err(problem)
 }
 
+fn damaged(error: exr::error::Error) -> String {
+    format!("not a readable EXR file: {error}")
+}
+
+/// Samples that a part claims.
+fn samples(header: &Header) -> usize {
+    header.layer_size.area().saturating_mul(header.channels.list.len())
+}
+
 /// Samples that the parts of an EXR file claim in all, and whether each part has this width and height. Nothing is decoded.
 ///
 /// # Errors
 /// A file that cannot be read.
 pub fn exr_claims(bytes: &[u8], size: [usize; 2]) -> std::result::Result<(usize, bool), String> {
-    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(|e| format!("not a readable EXR file: {e}"))?;
-    let samples = |header: &exr::meta::header::Header| header.layer_size.area().saturating_mul(header.channels.list.len());
+    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(damaged)?;
     let all = meta.headers.iter().map(samples).fold(0, usize::saturating_add);
     Ok((all, meta.headers.iter().all(|header| [header.layer_size.width(), header.layer_size.height()] == size)))
 }
@@ -114,10 +123,8 @@ pub fn exr_claims(bytes: &[u8], size: [usize; 2]) -> std::result::Result<(usize,
 /// # Errors
 /// A file that cannot be decoded, or has no colours.
 pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
-    let damaged = |e: exr::error::Error| format!("not a readable EXR file: {e}");
     let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(damaged)?;
-    for header in &meta.headers {
-        let samples = header.layer_size.area().saturating_mul(header.channels.list.len());
+    for samples in meta.headers.iter().map(samples) {
         if samples > MAX_SAMPLES {
             return Err(format!("its header claims {samples} samples; at most {MAX_SAMPLES} are accepted"));
         }
