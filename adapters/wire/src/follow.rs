@@ -247,6 +247,12 @@ impl RingFollower {
                         return Some(refused);
                     }
                     let (block, place) = self.next(simulation)?;
+                    // Blocks that were opened before this step was published are there now; their steps would fall behind.
+                    if !self.is_whole(simulation)
+                        && let Some(event) = self.scan()
+                    {
+                        return Some(event);
+                    }
                     self.current = Some((simulation, place));
                     block
                 }
@@ -268,6 +274,11 @@ impl RingFollower {
             }
         }
         None
+    }
+
+    /// Returns true if all blocks of a simulation were found.
+    fn is_whole(&self, simulation: Simulation) -> bool {
+        self.rings.values().filter(|followed| followed.simulation() == simulation).count() == simulation.1 as usize
     }
 
     /// The ring to read next, and the place of its oldest step. Replaced rings come first: their blocks are not opened anew before they are read.

@@ -18,7 +18,7 @@ use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::FileExt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Barrier, Mutex};
 use std::thread::{JoinHandle, sleep, spawn};
 use std::time::{Duration, Instant};
 
@@ -474,6 +474,38 @@ fn a_block_that_is_late_is_waited_for_and_no_step_is_lost() {
         let mut rest = |block_came: bool| sleep(Duration::from_micros(if block_came { 0 } else { 100 }));
         let (whole, given_up) = assemble(&folder, &mut rest, &|whole| whole.len() == 40);
         assert_eq!((whole, given_up), ((0..40).collect(), Vec::new()));
+    });
+}
+
+#[test]
+fn blocks_that_open_after_the_others_were_found_lose_no_step() {
+    let folder = Folder::new("opened-late");
+    let (first, later) = (&columns(9, 3)[..1], &columns(9, 3)[1..]);
+    let open = |block: &Description| Producer::open(&folder.0, block.clone(), 4, Policy::Wait(LONG)).unwrap();
+    let mut producers: Vec<Producer> = first.iter().map(open).collect();
+    let mut polls = 0;
+    std::thread::scope(|scope| {
+        // All blocks are open before the first step, and step together, as in any solver.
+        let mut start = |_| {
+            polls += 1;
+            // The first poll found the first block, and the second looked for others in vain.
+            if polls == 2 {
+                producers.extend(later.iter().map(open));
+                let together = Arc::new(Barrier::new(3));
+                for producer in producers.drain(..) {
+                    let together = together.clone();
+                    scope.spawn(move || {
+                        for n in 0..12 {
+                            together.wait();
+                            assert!(!publish(&producer, n).overwrote);
+                        }
+                        producer
+                    });
+                }
+            }
+        };
+        let (whole, given_up) = assemble(&folder, &mut start, &|whole| whole.last() == Some(&11));
+        assert_eq!((whole, given_up), ((0..12).collect(), Vec::new()));
     });
 }
 
