@@ -126,7 +126,7 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
 /// Measures traced frames, and frames answered by a network of 8 layers of 256 on a frequency encoding that is trained between them.
 fn published(mut scene: Settings, device: &Device, size: &str) {
     (scene.network.encoding, scene.network.hidden_layers, scene.network.width, scene.network.batch) =
-        (Encoding::Frequency, 8, 256, 1 << 16);
+        (Encoding::Frequency, 8, 256, Some(1 << 16));
     scene.surrogate.kind = Kind::Network;
     scene.time.warmup_frames = LEARNING;
     println!("<!-- block gated-published -->");

@@ -97,12 +97,19 @@ mod bench {
     }
 
     fn hash(levels: usize, features: usize, growth: f32, log2_table: u32, width: usize) -> NetworkSettings {
-        NetworkSettings { levels, features, growth, log2_table, width, ..NetworkSettings::default() }
+        NetworkSettings {
+            levels: Some(levels),
+            features,
+            growth: Some(growth),
+            log2_table: Some(log2_table),
+            width,
+            ..NetworkSettings::default()
+        }
     }
 
     /// The finest grid, which knows most after some seconds.
     fn finest() -> NetworkSettings {
-        NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }
+        NetworkSettings { base_resolution: Some(128), ..hash(4, 4, 1.6, 24, 64) }
     }
 
     fn step(count: usize, drawn: u64, rate: f64) -> PlannedStep {
@@ -237,7 +244,7 @@ mod bench {
 
     /// Generator of points.
     fn drawer(gpu: &Arc<Gpu>, domain: &Domain) -> Outcome<DeviceTraining> {
-        let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
+        let any = NetworkSettings { log2_table: Some(4), ..NetworkSettings::default() };
         let shape = Architecture::new(&any, &[0, 1, 2], domain.lengths())?;
         let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
         Ok(DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?)
@@ -649,7 +656,7 @@ mod bench {
 
         println!("| | network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
         println!("|---|---|---|---|---|---|---|---|---|");
-        let based = |base_resolution, settings| NetworkSettings { base_resolution, ..settings };
+        let based = |base_resolution, settings| NetworkSettings { base_resolution: Some(base_resolution), ..settings };
         let small = ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64));
         let large = ("4x4, growth 1.6, base 128, T = 2^24", finest());
         let alone = [
@@ -1004,7 +1011,7 @@ mod bench {
             let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
             let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK / parts)?, Batch::new(gpu, SCOUTS / parts)?);
             // The least network of the same inputs draws the points that tell how large the labels are.
-            let least = NetworkSettings { log2_table: 4, ..settings.clone() };
+            let least = NetworkSettings { log2_table: Some(4), ..settings.clone() };
             let least = Model::new(Architecture::new(&least, axes, domain.lengths())?, 1, base.is_some());
             let scout = DeviceTraining::new(gpu, &least, &objective)?;
             let mut pool = scout.replay_buffer(SCOUTS)?;

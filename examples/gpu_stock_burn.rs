@@ -53,7 +53,13 @@ fn main() -> Outcome<()> {
     let gpu = Gpu::open(0, &GpuSettings::default())?;
     let device = CudaDevice::new(0);
     let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
-    let hash = |log2_table| NetworkSettings { levels: 8, features: 2, growth: 2.0, log2_table, ..NetworkSettings::default() };
+    let hash = |log2_table| NetworkSettings {
+        levels: Some(8),
+        features: 2,
+        growth: Some(2.0),
+        log2_table: Some(log2_table),
+        ..NetworkSettings::default()
+    };
     let frequency =
         |hidden_layers, width| NetworkSettings { encoding: Encoding::Frequency, hidden_layers, width, ..NetworkSettings::default() };
     for (name, settings) in [

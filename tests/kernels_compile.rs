@@ -30,13 +30,13 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
 
 /// Networks of different encodings, widths and depths: some fill the registers, some have a single feature or no tables.
 fn networks() -> Vec<Network> {
-    let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
+    let usual = NetworkSettings { levels: Some(8), features: 2, ..NetworkSettings::default() };
     let both = vec![Input::Start, Input::Duration];
     let settings = [
         (usual.clone(), &[0, 1, 2][..]),
         (NetworkSettings { width: 128, features: 4, ..usual.clone() }, &[0, 1, 2]),
-        (NetworkSettings { levels: 5, features: 1, width: 21, hidden_layers: 1, ..usual.clone() }, &[1]),
-        (NetworkSettings { levels: 16, features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
+        (NetworkSettings { levels: Some(5), features: 1, width: 21, hidden_layers: 1, ..usual.clone() }, &[1]),
+        (NetworkSettings { levels: Some(16), features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, width: 512, hidden_layers: 16, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..usual.clone() }, &[0, 1, 2]),

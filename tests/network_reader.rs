@@ -44,8 +44,9 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     let later = DoubleGyre::new(3.0, 2.0, 30);
     let samples = traced(&tracer, uniform_points(3, 4000), false);
     let other = traced(&later, uniform_points(4, 4000), false);
-    let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
-    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 3, width: 24, octaves: 4, batch: 1024, ..hash.clone() };
+    let hash = NetworkSettings { log2_table: Some(9), batch: Some(1024), ..NetworkSettings::default() };
+    let frequency =
+        NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 3, width: 24, octaves: 4, batch: Some(1024), ..hash.clone() };
     let published = NetworkSettings { loss: Loss::Published, ..hash.clone() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
     let both = NetworkSettings { inputs: vec![Input::Duration, Input::Start], ..start.clone() };
@@ -90,7 +91,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
 fn the_reader_refuses_what_it_cannot_evaluate() {
     let folder = tempfile::tempdir().unwrap();
     let tracer = DoubleGyre::new(0.0, 3.0, 30);
-    let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
+    let hash = NetworkSettings { log2_table: Some(9), batch: Some(1024), ..NetworkSettings::default() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
     let flow_map = NetworkSettings { target: Target::FlowMap, ..hash.clone() };
     for (name, network, kind, times, expected) in [

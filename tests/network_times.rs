@@ -43,7 +43,7 @@ fn one_network_knows_two_windows() {
         assert!((rms(&frozen, &held_out[0]) - errors[0]).abs() < 1e-6, "what is frozen is asked for the window of its time");
         errors
     };
-    let without = NetworkSettings { log2_table: 14, width: 32, batch: 2048, ..NetworkSettings::default() };
+    let without = NetworkSettings { log2_table: Some(14), width: 32, batch: Some(2048), ..NetworkSettings::default() };
     let with_start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([0.0, 5.0]), ..without.clone() };
     let (with, without) = (errors(&with_start), errors(&without));
     for (with, without) in with.iter().zip(&without) {
@@ -103,7 +103,14 @@ fn durations_below_tau_are_learned() {
         }
         worst
     };
-    let network = NetworkSettings { levels: 2, log2_table: 12, base_resolution: 8, width: 16, batch: 1024, ..NetworkSettings::default() };
+    let network = NetworkSettings {
+        levels: Some(2),
+        log2_table: Some(12),
+        base_resolution: Some(8),
+        width: 16,
+        batch: Some(1024),
+        ..NetworkSettings::default()
+    };
     let with = error("[\"duration\"]", &NetworkSettings { inputs: vec![Input::Duration], ..network.clone() });
     let without = error("[]", &network);
     // Without the input, the network predicts 2.8 for all durations.

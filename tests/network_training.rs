@@ -11,7 +11,7 @@ use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Tar
 use ridgewatch::surrogate::{CheckpointError, HostSurrogate, Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace, build};
 
 fn small() -> NetworkSettings {
-    NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }
+    NetworkSettings { levels: Some(6), log2_table: Some(12), width: 32, batch: Some(2048), ..NetworkSettings::default() }
 }
 
 fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Trace) -> HostSurrogate {

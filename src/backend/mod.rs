@@ -163,6 +163,12 @@ pub trait Surrogate: Send + Sync + Sized {
     fn trains_on_device(&self) -> bool;
     /// Trains for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
     fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError>;
+    /// Traces `count` uniform random points, a function of `seed` and of their numbers from `first` on, as labels of training that stay on its
+    /// device. Returns false, without effect, if training is on the CPU or has not begun, or if the domain has missing cells.
+    fn trace_labels(&mut self, tracer: &Self::Tracer, seed: u64, first: u64, count: usize) -> Result<bool, DeviceError> {
+        let _ = (tracer, seed, first, count);
+        Ok(false)
+    }
     /// Moves the surrogate to a new window. Setting `stop` may end the tracing of its table early; the surrogate is then unusable.
     fn window_slid(&mut self, tracer: &Self::Tracer, stop: &AtomicBool) -> Result<(), DeviceError>;
     /// Traces about `most` further nodes of a finer table, as [`ridgewatch_surrogate::Hybrid::refine_table`] does.

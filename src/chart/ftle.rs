@@ -2,7 +2,7 @@
 
 use super::slides::FirstSlides;
 use super::{Charting, device_name, failed, front, pick, with_method};
-use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
+use crate::backend::{Backend, Cpu, Device, Surrogate, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
 use crate::field::{DomainPoint, UnitPoint};
@@ -15,6 +15,7 @@ use crate::run::{Plan, RunError, Settings, Setup, Slide, auto_steps};
 use crate::surrogate::network::{Encoding, NetworkSettings};
 use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
 use serde::Serialize;
+use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
@@ -33,14 +34,19 @@ const TIMED: f64 = 0.25;
 /// Fewest points of a timed batch, and most on the CPU and on a GPU.
 const MIN_BATCH: usize = 1 << 12;
 const MAX_BATCH: [usize; 2] = [1 << 20, 1 << 23];
-/// Seconds for which networks are trained before each measurement.
+/// Seconds for which networks are trained before each measurement, the tracing of their labels included.
 const TRAINED: [f64; 3] = [1.0, 3.0, 10.0];
+/// Seconds of training between fresh labels, and how often a label is trained on.
+const SLICE: f64 = 0.25;
+const REUSE: u64 = 4;
+/// Labels before the first training, and most fresh ones afterwards.
+const FIRST_LABELS: usize = 1 << 16;
+const MAX_FRESH: usize = 1 << 21;
+/// A small network has 2^-5 of the entries.
+const SMALLER: u32 = 5;
 /// What is said of methods that ran on the CPU in a chart of a GPU.
 #[cfg(feature = "cuda")]
 const ON_THE_CPU: &str = ", on the CPU";
-/// Seconds of tracing labels for networks, and most labels.
-const LABELS_SECONDS: f64 = 2.0;
-const MAX_LABELS: usize = 1 << 24;
 
 /// A method with a setting.
 #[derive(Debug, Clone, Serialize)]
@@ -180,7 +186,7 @@ impl Opened {
 
     /// Uniform random points in unit and in domain coordinates; in two dimensions all lie in the middle of the slab.
     pub(super) fn random_points(&self, count: usize) -> (Vec<UnitPoint>, Vec<DomainPoint>) {
-        let Points { unit, domain } = Points::random(self, count, 5);
+        let Points { unit, domain } = Points::random(self, 0..count as u32, 5);
         (unit, domain)
     }
 
@@ -198,9 +204,9 @@ pub(super) struct Points {
 
 impl Points {
     /// Uniform random points; in two dimensions all lie in the middle of the slab.
-    pub(super) fn random(opened: &Opened, count: usize, stream: u32) -> Self {
+    pub(super) fn random(opened: &Opened, numbers: Range<u32>, stream: u32) -> Self {
         let (seed, domain) = (opened.plan.scene.seed, &opened.plan.domain);
-        let unit: Vec<UnitPoint> = (0..count as u32)
+        let unit: Vec<UnitPoint> = numbers
             .map(|i| {
                 let words = philox([i, stream, 0, 0], [seed as u32, (seed >> 32) as u32]);
                 UnitPoint(std::array::from_fn(|axis| if axis < domain.dimensions { unit(words[axis]) } else { 0.5 }))
@@ -332,7 +338,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let ramp = ramp(opened, &known);
     let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
     let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
-    let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
+    let timed = Points::random(opened, 0..MAX_BATCH[usize::from(charting.device.is_gpu())] as u32, 1);
     let mut bench =
         Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, nodes_per_second: None, found: Vec::new() };
     let steps = chosen_steps.or(match opened.plan.map.steps {
@@ -355,9 +361,11 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             tracing(&mut bench, &mut backend, steps, "")?;
             // A closed form has no snapshots to store.
             if opened.window_bytes > 0 {
-                let mut half = Cuda::new(&CudaDevice { storage: Some(Storage::F16), ..device.clone() });
-                bench.window_bytes = opened.window_bytes / Storage::F32.bytes() * Storage::F16.bytes();
-                tracing(&mut bench, &mut half, steps, ", f16 storage")?;
+                for (storage, name) in [(Storage::F16, ", f16 storage"), (Storage::F16Pairs, ", f16 pairs")] {
+                    let mut half = Cuda::new(&CudaDevice { storage: Some(storage), ..device.clone() });
+                    bench.window_bytes = opened.window_bytes / Storage::F32.bytes() * storage.bytes();
+                    tracing(&mut bench, &mut half, steps, name)?;
+                }
                 bench.window_bytes = opened.window_bytes;
             }
             tables(&mut bench, &mut backend)?;
@@ -397,11 +405,11 @@ fn ramp(opened: &Opened, ftle: &[f64]) -> f64 {
 /// Points and their true FTLE: as many as the truth integrates in `seconds`. NaN at points without a velocity.
 fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64>) {
     let mut traced = Traced::default();
-    let probe = Points::random(opened, MIN_POINTS, 2);
+    let probe = Points::random(opened, 0..MIN_POINTS as u32, 2);
     let began = Instant::now();
     tracer.trace(&probe.domain, Extras::default(), &mut traced);
     let affordable = seconds * MIN_POINTS as f64 / began.elapsed().as_secs_f64();
-    let points = Points::random(opened, (affordable as usize).clamp(MIN_POINTS, MAX_POINTS), 0);
+    let points = Points::random(opened, 0..(affordable as usize).clamp(MIN_POINTS, MAX_POINTS) as u32, 0);
     tracer.trace(&points.domain, Extras::default(), &mut traced);
     let ftle = |(s, seed): (&f64, &DomainPoint)| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
     let truth = traced.log_stretch_f64.iter().zip(&points.domain).map(ftle).collect();
@@ -555,23 +563,24 @@ fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), 
 fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), RunError> {
     let map = bench.opened.plan.map.clone();
     let Some(tracer) = tracer_of(bench, backend, "labels for networks", &map)? else { return Ok(()) };
-    let (buffer, label_seconds) = bench.labels(&tracer)?;
-    let own = bench.opened.own_nodes(bench.charting.device.is_gpu());
+    let is_gpu = bench.charting.device.is_gpu();
+    let own = bench.opened.own_nodes(is_gpu);
     let scene = NetworkSettings { inputs: Vec::new(), start_range: None, ..bench.opened.plan.scene.network.clone() };
-    let small = NetworkSettings { log2_table: scene.log2_table.min(15), ..scene.clone() };
-    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene.clone() };
+    let suited = bench.opened.shape().filter(|_| is_gpu).map_or(scene.clone(), |shape| scene.suited_to(shape));
+    let small = NetworkSettings { log2_table: Some(suited.log2_table().saturating_sub(SMALLER).max(4)), ..scene.clone() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene };
     let narrow = NetworkSettings { hidden_layers: 4, width: 64, ..frequency.clone() };
     let mut variants = vec![
-        ("base + residual", Kind::Residual, scaled(own, 0.5), scene.clone()),
+        ("base + residual", Kind::Residual, scaled(own, 0.5), suited.clone()),
         ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()),
-        ("network", Kind::Network, own, scene),
+        ("network", Kind::Network, own, suited),
         ("network", Kind::Network, own, small),
-        ("network", Kind::Network, own, if bench.charting.device.is_gpu() { frequency } else { narrow }),
+        ("network", Kind::Network, own, if is_gpu { frequency } else { narrow }),
     ];
     variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
     for (name, kind, nodes, network) in variants {
         let size = match network.encoding {
-            Encoding::HashGrid => format!("2^{} entries", network.log2_table),
+            Encoding::HashGrid => format!("{}x{}, 2^{} entries", network.levels(), network.features, network.log2_table()),
             Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
         };
         let what = format!("{name}, {size}");
@@ -582,24 +591,68 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
         let began = Instant::now();
         let settings = SurrogateSettings { kind, table_nodes: Some(nodes), ..SurrogateSettings::default() };
         let Some(mut surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
-        let mut spent = label_seconds + began.elapsed().as_secs_f64();
-        let mut trained = 0.0;
+        let built = began.elapsed().as_secs_f64();
+        let mut lessons = Lessons::new(bench.opened);
         for seconds in TRAINED {
             if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
                 break;
             }
-            let learned = bench.charting.pool.install(|| surrogate.learn(&buffer, seconds - trained, u64::MAX)).map_err(failed)?;
-            if learned.steps == 0 {
+            let before = lessons.steps;
+            while lessons.seconds < seconds {
+                bench.charting.pool.install(|| lessons.give(&mut surrogate, &tracer, seconds))?;
+            }
+            if lessons.steps == before {
                 bench.charting.skip(format_args!("{what}, {seconds} s of training"), "no optimizer step ended in time");
                 continue;
             }
-            spent += learned.seconds;
-            trained = seconds;
             let frozen = surrogate.freeze().map_err(failed)?;
-            bench.measure_predictor(name, format!("{size}, {seconds} s"), spent, &frozen)?;
+            bench.measure_predictor(name, format!("{size}, {seconds} s"), built + lessons.seconds, &frozen)?;
         }
     }
     Ok(())
+}
+
+/// Training on labels at uniform random points that are traced on the way, as the frames of a run trace theirs.
+struct Lessons<'a> {
+    opened: &'a Opened,
+    /// Labels on the host.
+    buffer: ReplayBuffer,
+    /// Points traced so far, and in the next turn.
+    drawn: u64,
+    fresh: usize,
+    /// Optimizer steps so far.
+    steps: u64,
+    /// Seconds of tracing and training so far.
+    seconds: f64,
+}
+
+impl<'a> Lessons<'a> {
+    fn new(opened: &'a Opened) -> Self {
+        let buffer = ReplayBuffer::new(opened.plan.scene.training.replay_buffer);
+        Self { opened, buffer, drawn: 0, fresh: FIRST_LABELS, steps: 0, seconds: 0.0 }
+    }
+
+    /// Traces fresh labels and trains for [`SLICE`] seconds, until about `end` seconds in all.
+    fn give<S: Surrogate<Tracer = T>, T: Trace>(&mut self, surrogate: &mut S, tracer: &T, end: f64) -> Result<(), RunError> {
+        const STREAM: u32 = 4;
+        let began = Instant::now();
+        let scene = &self.opened.plan.scene;
+        if !surrogate.trace_labels(tracer, scene.seed, self.drawn, self.fresh).map_err(failed)? {
+            let numbers = self.drawn as u32..self.drawn as u32 + self.fresh as u32;
+            let points = Points::random(self.opened, numbers, STREAM);
+            self.buffer.push(&audit::trace(tracer, &points.unit, scene.network.label_extras()).map_err(failed)?.samples);
+        }
+        self.drawn += self.fresh as u64;
+        let traced = began.elapsed().as_secs_f64();
+        let left = (end - self.seconds - traced).clamp(0.01, SLICE);
+        let learned = surrogate.learn(&self.buffer, left, u64::MAX).map_err(failed)?;
+        // Tracing takes no longer than training.
+        let as_long = self.fresh as f64 * learned.seconds / traced;
+        self.fresh = ((learned.samples / REUSE) as usize).min(as_long as usize).clamp(MIN_BATCH, MAX_FRESH);
+        self.steps += learned.steps;
+        self.seconds += began.elapsed().as_secs_f64();
+        Ok(())
+    }
 }
 
 impl Bench<'_, '_> {
@@ -611,21 +664,6 @@ impl Bench<'_, '_> {
         let began = Instant::now();
         self.charting.pool.install(|| tracer.trace(seeds, Extras::default(), &mut traced));
         self.nodes_per_second = Some(seeds.len() as f64 / began.elapsed().as_secs_f64());
-    }
-
-    /// Traces uniform random labels for some seconds; returns them with the seconds.
-    fn labels(&mut self, tracer: &dyn Trace) -> Result<(ReplayBuffer, f64), RunError> {
-        let extras = self.opened.plan.scene.network.label_extras();
-        let trace = |count: usize, stream: u32| {
-            let points = Points::random(self.opened, count, stream);
-            let began = Instant::now();
-            let labels = self.charting.pool.install(|| audit::trace(tracer, &points.unit, extras)).map_err(failed)?.samples;
-            Ok::<_, RunError>((labels, began.elapsed().as_secs_f64()))
-        };
-        let per_second = MIN_BATCH as f64 / trace(MIN_BATCH, 3)?.1;
-        let count = ((LABELS_SECONDS * per_second) as usize).clamp(MIN_BATCH, MAX_LABELS);
-        let (labels, seconds) = trace(count, 4)?;
-        Ok((ReplayBuffer::holding(&labels), seconds))
     }
 }
 
@@ -639,8 +677,14 @@ fn surrogate_of<B: Backend>(
     tracer: &B::Tracer,
 ) -> Result<Option<B::Surrogate>, RunError> {
     let plan = &bench.opened.plan;
-    let request =
-        SurrogateRequest { settings, network, domain: &plan.domain, seed: plan.scene.seed, replay_buffer: MAX_LABELS, stop: &NEVER };
+    let request = SurrogateRequest {
+        settings,
+        network,
+        domain: &plan.domain,
+        seed: plan.scene.seed,
+        replay_buffer: plan.scene.training.replay_buffer,
+        stop: &NEVER,
+    };
     match bench.charting.pool.install(|| backend.surrogate(&request, tracer)) {
         Ok(surrogate) => Ok(Some(surrogate)),
         Err(error) => bench.charting.refused(what, failed(error)).map(|()| None),

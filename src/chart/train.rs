@@ -110,12 +110,14 @@ impl Training<'_> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         let extras = settings.network.label_extras();
         let began = Instant::now();
-        let labels =
-            crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
-        let label_seconds = began.elapsed().as_secs_f64();
-        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default())
+        let labels = crate::backend::audit::trace(&tracer, &Points::random(opened, 0..options.labels as u32, 6).unit, extras)
             .map_err(failed)?
             .samples;
+        let label_seconds = began.elapsed().as_secs_f64();
+        let validation =
+            crate::backend::audit::trace(&tracer, &Points::random(opened, 0..options.validation as u32, 7).unit, Extras::default())
+                .map_err(failed)?
+                .samples;
         let request = SurrogateRequest {
             settings: &settings.surrogate,
             network: &settings.network,
@@ -126,7 +128,7 @@ impl Training<'_> {
         };
         let mut surrogate = backend.surrogate(&request, &tracer).map_err(failed)?;
         let buffer = ReplayBuffer::holding(&labels);
-        let steps_per_epoch = (labels.len() / settings.network.batch).max(1) as u64;
+        let steps_per_epoch = (labels.len() / settings.network.batch()).max(1) as u64;
         let mut report =
             TrainReport { epochs: Vec::new(), label_seconds, bytes: surrogate.bytes(), device: backend.name(), interrupted: false };
         let (mut steps, mut seconds, mut rollbacks) = (0, 0.0, 0);

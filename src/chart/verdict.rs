@@ -5,6 +5,9 @@ use super::ftle::{CHARGED, Front, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel, RESOLVED, TARGETS};
 use crate::render::Method;
 
+/// Multiples of the tolerance for which the cheapest method is named, in words.
+const TOLERANCES: [(f64, &str); 3] = [(3.0, "three times the tolerance"), (1.0, "the tolerance"), (0.3, "three tenths of the tolerance")];
+
 /// Sentences about the front, the picks, and where each method wins.
 pub fn verdict(chart: &Chart) -> Vec<String> {
     let mut said = Vec::new();
@@ -55,7 +58,10 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
             size(best.bytes)
         ));
     }
-    said.extend(cheapest(methods.iter().copied().filter(|point| point.rms <= tolerance)));
+    for (factor, words) in TOLERANCES {
+        let within = cheapest(methods.iter().copied().filter(|point| point.rms <= factor * tolerance));
+        said.extend(within.map(|cheapest| format!("Cheapest within {words} ({:.1e}{per}): {cheapest}.", factor * tolerance)));
+    }
     for Front { samples, methods, .. } in panel.fronts.iter().filter(|front| front.samples == CHARGED[1]) {
         let on = |place: &usize| {
             let point = &panel.methods[*place];
@@ -116,7 +122,7 @@ fn cheapest<'a>(within: impl Iterator<Item = &'a FtlePoint>) -> Option<String> {
             (saved > 0.0 && at > from).then_some((at, point))
         };
         let next = within.iter().filter_map(|point| crossing(point)).min_by(|a, b| a.0.total_cmp(&b.0));
-        let Some((at, point)) = next else { return Some(format!("Cheapest within the tolerance: {said}.")) };
+        let Some((at, point)) = next else { return Some(said) };
         said += &format!(", from {at:.1e} samples on {}", name(point));
         (best, from) = (point, at);
     }
@@ -224,7 +230,7 @@ mod tests {
         };
         // Costs cross at 200 (1 s against 200 / 100 - 200 / 200), and at 20,000 (100 s against 20,000 / 200 - 20,000 / 1e9).
         let points = [point("tracing", 0.0, 100.0), point("table", 1.0, 200.0), point("dear", 500.0, 150.0), point("network", 101.0, 1e9)];
-        let said = "Cheapest within the tolerance: tracing (set), from 2.0e2 samples on table (set), from 2.0e4 samples on network (set).";
+        let said = "tracing (set), from 2.0e2 samples on table (set), from 2.0e4 samples on network (set)";
         assert_eq!(cheapest(points.iter()).as_deref(), Some(said));
         assert_eq!(cheapest(std::iter::empty()), None);
     }

@@ -145,7 +145,7 @@ impl<B: Backend> Cycle<'_, B> {
         learning.peak = f32::NEG_INFINITY;
         if learning.sizing.is_some() {
             // Sizes that the former map rejected may suit this one.
-            learning.sizing = Some(Sizing::new(&learning.settings, &scene.network, &plan.domain)?);
+            learning.sizing = Some(Sizing::new(&learning.settings, &learning.network, &plan.domain)?);
         }
         self.run.report.time_resolution = match &slide.velocity {
             VelocitySource::Window(window) => Some(self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?),

@@ -6,7 +6,7 @@
 
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
-use super::decision::{Decision, enter_colours, why_steps};
+use super::decision::{Decision, enter_colours, suited_network, why_steps};
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
 use super::refine::Frames;
@@ -27,7 +27,7 @@ use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer,
 use crate::progress;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::source::SourceKind;
-use crate::surrogate::network::{Size, Times};
+use crate::surrogate::network::{NetworkSettings, Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
 };
@@ -185,6 +185,8 @@ pub(super) struct Learning {
     pub(super) start: f64,
     /// Settings of the surrogate, with the nodes of the data if a table has no others.
     pub(super) settings: SurrogateSettings,
+    /// Settings of the network, with sizes that suit the window where the scene leaves them open.
+    pub(super) network: NetworkSettings,
     /// Reason for the nodes of a table of a new window.
     pub(super) why_nodes: String,
     /// Search for the size, with `size = "auto"`.
@@ -488,7 +490,15 @@ impl<'a> Run<'a> {
         };
         let settings = settings.unwrap_or(for_picture);
         let sized = scene.render.method.has_surrogate() && scene.network.size == Size::Auto;
-        let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
+        let learns = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Table;
+        let network = match &first.velocity {
+            VelocitySource::Window(window) if learns && options.device.is_gpu() => {
+                window.grid().map(|grid| suited_network(&scene.network, grid.shape(), &mut report.decisions))
+            }
+            _ => None,
+        };
+        let network = network.unwrap_or_else(|| scene.network.clone());
+        let sizing = sized.then(|| Sizing::new(&settings, &network, &plan.domain)).transpose()?;
         let times = Times::new(&scene.network, flow.tau());
         let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
         if !scene.network.inputs.is_empty() {
@@ -510,6 +520,7 @@ impl<'a> Run<'a> {
             times,
             start: flow.start(),
             settings,
+            network,
             why_nodes: because,
             sizing,
             resize: None,

@@ -2,6 +2,7 @@
 
 use super::{Settings, TransferRecord};
 use crate::render::Method;
+use crate::surrogate::network::NetworkSettings;
 use serde::Serialize;
 
 /// A choice for a setting that the scene leaves open. Giving the setting overrides it.
@@ -68,4 +69,24 @@ pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
         None if difference.is_finite() => format!("the log-stretch differs by {difference:.3} rms from that of twice as many"),
         None => "no number of steps had a finite difference from twice as many".to_owned(),
     }
+}
+
+/// The network with sizes that suit a window of `shape` nodes where they are open, and enters these choices.
+pub(super) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisions: &mut Vec<Decision>) -> NetworkSettings {
+    let suited = given.suited_to(shape);
+    if suited != *given {
+        let longest = shape.into_iter().max().unwrap_or(1);
+        let chosen = [
+            ("network.levels", given.levels.is_none(), suited.levels().to_string()),
+            ("network.growth", given.growth.is_none(), suited.growth().to_string()),
+            ("network.base_resolution", given.base_resolution.is_none(), suited.base_resolution().to_string()),
+            ("network.log2_table", given.log2_table.is_none(), suited.log2_table().to_string()),
+            ("network.batch", given.batch.is_none(), suited.batch().to_string()),
+        ];
+        for (setting, _, value) in chosen.into_iter().filter(|(_, is_open, _)| *is_open) {
+            let why = format!("a GPU trains on a window of {longest} nodes: few levels, of which the finest has two thirds as many cells");
+            Decision::new(setting, value, why).enter(decisions);
+        }
+    }
+    suited
 }

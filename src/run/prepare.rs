@@ -35,8 +35,9 @@ impl Run<'_> {
     /// Builds the surrogate at the present size.
     pub(super) fn build_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let (scene, learning) = (&self.plan.scene, &self.learning);
-        let plain = || (learning.settings.clone(), scene.network.clone());
-        let (settings, network) = learning.sizing.as_ref().map_or_else(plain, |sizing| sizing.settings(&learning.settings, &scene.network));
+        let plain = || (learning.settings.clone(), learning.network.clone());
+        let (settings, network) =
+            learning.sizing.as_ref().map_or_else(plain, |sizing| sizing.settings(&learning.settings, &learning.network));
         let request = SurrogateRequest {
             settings: &settings,
             network: &network,

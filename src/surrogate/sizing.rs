@@ -61,8 +61,8 @@ impl Sizing {
             let (table, network) = at_size(settings, network, nodes, axes, size);
             match settings.kind {
                 Kind::Table => (table.table_nodes, 0, 0),
-                Kind::Network => (None, network.width, network.log2_table),
-                Kind::Residual => (table.table_nodes, network.width, network.log2_table),
+                Kind::Network => (None, network.width, network.log2_table()),
+                Kind::Residual => (table.table_nodes, network.width, network.log2_table()),
             }
         };
         // Larger sizes do not differ beyond the scene's bounds.
@@ -132,7 +132,7 @@ fn at_size(
     let mut sized = network.clone();
     sized.width = network.width.min(SMALLEST_WIDTH << size.div_ceil(2));
     if network.encoding == Encoding::HashGrid {
-        sized.log2_table = network.log2_table.min(SMALLEST_LOG2_TABLE + size);
+        sized.log2_table = Some(network.log2_table().min(SMALLEST_LOG2_TABLE + size));
     }
     let table = nodes.map(|n| ((n as f64 * growth) as usize).max(2));
     (SurrogateSettings { table_nodes: Some(table), ..settings.clone() }, sized)
@@ -182,13 +182,13 @@ mod tests {
         let at = |size| at_size(&SurrogateSettings::default(), &network, [256, 128, 2], 2, size);
         assert_eq!(at(PLAIN).0.table_nodes.map(|n| [n[0], n[1]]), Some([256, 128]));
         assert_eq!(at(0).0.table_nodes.map(|n| [n[0], n[1]]), Some([128, 64]));
-        assert_eq!((at(0).1.log2_table, at(0).1.width), (12, 16));
-        assert_eq!((at(LARGEST).1.log2_table, at(LARGEST).1.width), (network.log2_table, network.width));
+        assert_eq!((at(0).1.log2_table(), at(0).1.width), (12, 16));
+        assert_eq!((at(LARGEST).1.log2_table(), at(LARGEST).1.width), (network.log2_table(), network.width));
         let [x, y, _] = at_size(&SurrogateSettings::default(), &network, [4096, 2048, 2], 2, LARGEST).0.table_nodes.unwrap();
         assert_eq!([x, y], [4096, 2048], "beyond 2^21 nodes those that the scene sets are the most");
         let domain = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
         let most = |kind, width| {
-            let network = NetworkSettings { width, log2_table: 14, ..NetworkSettings::default() };
+            let network = NetworkSettings { width, log2_table: Some(14), ..NetworkSettings::default() };
             Sizing::new(&SurrogateSettings { kind, ..SurrogateSettings::default() }, &network, &domain).unwrap().most
         };
         // 2^12 entries are doubled twice; width 64 is reached at size 3; the plain table has 2^15 nodes. Nothing is tried that changes nothing.

@@ -175,7 +175,7 @@ impl<T: Training> Trainer<T> {
         }
         // The network moves to the device together with the scale of the targets, so the scale must be known first.
         if self.standardised {
-            self.training.begin(&self.objective, labels.buffer.capacity(), self.settings.batch)?;
+            self.training.begin(&self.objective, labels.buffer.capacity(), self.settings.batch())?;
         }
         let SyncedSamples { usable, dropped } = self.training.sync(&self.objective, labels)?;
         learned.dropped = dropped as u64;
@@ -183,7 +183,7 @@ impl<T: Training> Trainer<T> {
             return Ok(());
         }
         // With few samples, a large batch would only repeat them.
-        let count = self.settings.batch.min(usable.max(256));
+        let count = self.settings.batch().min(usable.max(256));
         let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
         let began = self.training.steps_taken();
         while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {

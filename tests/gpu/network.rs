@@ -32,7 +32,14 @@ pub(super) fn cases() -> Vec<Case> {
 }
 
 pub(super) fn few_entries() -> NetworkSettings {
-    NetworkSettings { log2_table: 7, base_resolution: 4, growth: 1.2, octaves: 4, batch: 300, ..NetworkSettings::default() }
+    NetworkSettings {
+        log2_table: Some(7),
+        base_resolution: Some(4),
+        growth: Some(1.2),
+        octaves: 4,
+        batch: Some(300),
+        ..NetworkSettings::default()
+    }
 }
 
 /// What has so many parameters that a test cannot afford its loss hundreds of times.
@@ -40,10 +47,10 @@ pub(super) fn larger_cases() -> [Case; 5] {
     let published = NetworkSettings { encoding: Encoding::Frequency, width: 256, ..NetworkSettings::default() };
     [
         Case { name: "three passes, tables", settings: NetworkSettings { width: 600, ..few_entries() }, axes: &[0, 1, 2] },
-        Case { name: "wider encoding", settings: NetworkSettings { levels: 32, features: 8, ..few_entries() }, axes: &[0, 1, 2] },
+        Case { name: "wider encoding", settings: NetworkSettings { levels: Some(32), features: 8, ..few_entries() }, axes: &[0, 1, 2] },
         Case {
             name: "three passes, wider encoding",
-            settings: NetworkSettings { width: 600, levels: 32, features: 8, ..few_entries() },
+            settings: NetworkSettings { width: 600, levels: Some(32), features: 8, ..few_entries() },
             axes: &[0, 1, 2],
         },
         Case { name: "2x256, as published", settings: NetworkSettings { hidden_layers: 2, ..published.clone() }, axes: &[0, 1, 2] },
@@ -311,7 +318,7 @@ fn parts_of_a_batch_add_up() {
 #[ignore = "needs a GPU"]
 fn lines_without_a_gradient_wait() {
     // Two samples reach a few entries of a large table.
-    let settings = NetworkSettings { levels: 2, features: 2, base_resolution: 40, ..NetworkSettings::default() };
+    let settings = NetworkSettings { levels: Some(2), features: 2, base_resolution: Some(40), ..NetworkSettings::default() };
     let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
     let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
     let model = Model::new(shape, 5, false);
@@ -387,7 +394,7 @@ fn held_out_and_broken_samples_are_not_learned_from() {
 #[test]
 #[ignore = "needs a GPU"]
 fn what_the_kernels_do_not_take_is_refused() {
-    let settings = NetworkSettings { log2_table: 10, target: Target::FlowMap, jacobian_weight: 0.3, ..NetworkSettings::default() };
+    let settings = NetworkSettings { log2_table: Some(10), target: Target::FlowMap, jacobian_weight: 0.3, ..NetworkSettings::default() };
     let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
     let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
     let refused = DeviceTraining::new(&gpu(), &Model::new(shape, 1, false), &objective).unwrap_err();

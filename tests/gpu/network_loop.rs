@@ -289,8 +289,9 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     let tracer = CudaTracer::new(&SnapshotStore::new(&gpu), &gpu, source, &map(10.0, 40), 0.0, Tuning::default()).unwrap();
     // 60 MB on the device, in several pieces and a rest.
     let (log2_table, batch) = if small() { (12, 1 << 10) } else { (18, 1 << 16) };
-    let network = NetworkSettings { levels: 8, log2_table, batch, ..NetworkSettings::default() };
-    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: batch / 4, ..NetworkSettings::default() };
+    let network = NetworkSettings { levels: Some(8), log2_table: Some(log2_table), batch: Some(batch), ..NetworkSettings::default() };
+    let frequency =
+        NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: Some(batch / 4), ..NetworkSettings::default() };
     let buffer = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
     let (rounds, steps) = if small() { (1, 10) } else { (3, 1000) };
     let folder = tempfile::tempdir().unwrap();

@@ -148,7 +148,8 @@ fn training_learns_of_the_duration_what_the_cpu_learns() {
 /// A function of the inputs, whichever they are: who does not see one of them cannot learn it.
 fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let inputs = time.into_iter().collect();
-    let settings = NetworkSettings { levels: 8, features: 2, log2_table: 15, growth: 1.5, inputs, ..NetworkSettings::default() };
+    let settings =
+        NetworkSettings { levels: Some(8), features: 2, log2_table: Some(15), growth: Some(1.5), inputs, ..NetworkSettings::default() };
     let extent = [1.0; 3];
     let shape = Architecture::new(&settings, axes, extent).unwrap();
     let value = |row: Row| {
@@ -223,7 +224,7 @@ fn a_loss_that_is_no_number_is_rolled_back() {
     let source = gyre([0.0, 0.0], [2.0, 1.0]);
     let tracer = CudaTracer::new(store(), &gpu(), source, &map(10.0, 20), 0.0, Tuning::default()).unwrap();
     let samples = traced(tracer.host(), uniform_points(1, 5_000), false);
-    let settings = NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() };
+    let settings = NetworkSettings { levels: Some(6), log2_table: Some(12), width: 32, batch: Some(2048), ..NetworkSettings::default() };
     let mut network = resident(&gpu(), Kind::Network, [2; 3], &settings, &tracer);
     let points = uniform_points(2, 2_000);
     let mut predictions = |learned: &ReplayBuffer, seconds, steps| {

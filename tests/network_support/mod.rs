@@ -134,14 +134,14 @@ pub struct Case {
 /// Every kind of encoding, loss and target, every number of axes and features; widths and depths that fill blocks of 16 and that do not.
 pub fn cases() -> Vec<Case> {
     let small = NetworkSettings {
-        levels: 3,
+        levels: Some(3),
         features: 2,
-        log2_table: 7,
-        base_resolution: 4,
-        growth: 2.0,
+        log2_table: Some(7),
+        base_resolution: Some(4),
+        growth: Some(2.0),
         octaves: 4,
         width: 16,
-        batch: 300,
+        batch: Some(300),
         learning_rate: Some(1e-2),
         ..NetworkSettings::default()
     };
@@ -155,7 +155,7 @@ pub fn cases() -> Vec<Case> {
     vec![
         case("2 axes", plane, |_| ()),
         case("3 axes, width 64", space, |s| s.width = 64),
-        case("8 levels, finer than 8 samples per node", space, |s| (s.levels, s.log2_table) = (8, 12)),
+        case("8 levels, finer than 8 samples per node", space, |s| (s.levels, s.log2_table) = (Some(8), Some(12))),
         case("4 features, width 128", space, |s| (s.features, s.width) = (4, 128)),
         case("8 features, x and z", &[0, 2], |s| s.features = 8),
         case("1 feature, 1 axis, odd width", &[1], |s| (s.features, s.width) = (1, 21)),

@@ -46,7 +46,7 @@ fn the_page_names_all_that_a_checkpoint_holds_and_nothing_else() {
     let page = page("protocol.md");
     let weights = page.split("## Weights").nth(1).unwrap();
     let (folder, tracer) = (tempfile::tempdir().unwrap(), DoubleGyre::new(0.0, 3.0, 20));
-    let hash = NetworkSettings { levels: 2, log2_table: 6, width: 16, batch: 64, ..NetworkSettings::default() };
+    let hash = NetworkSettings { levels: Some(2), log2_table: Some(6), width: 16, batch: Some(64), ..NetworkSettings::default() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([0.0, 1.0]), ..hash.clone() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, ..hash.clone() };
     let (mut tensors, mut notes, mut shapes) = (BTreeSet::new(), BTreeSet::new(), Vec::new());

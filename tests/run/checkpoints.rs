@@ -106,7 +106,7 @@ const TARGET: &str = "RIDGEWATCH_TEST_CHECKPOINT";
 fn network() -> HostSurrogate {
     let tracer = DoubleGyre::new(0.0, 5.0, 10);
     // 24 MB a checkpoint, so that it takes a while.
-    let network = NetworkSettings { levels: 6, log2_table: 17, ..NetworkSettings::default() };
+    let network = NetworkSettings { levels: Some(6), log2_table: Some(17), ..NetworkSettings::default() };
     let settings = SurrogateSettings { kind: Kind::Network, table_nodes: None, ..SurrogateSettings::default() };
     let mut surrogate = build(&settings, &network, tracer.domain(), 5, &tracer).unwrap();
     surrogate.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 500), false)), f64::INFINITY, 2).unwrap();

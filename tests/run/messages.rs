@@ -48,7 +48,7 @@ fn waves(x: f64, y: f64) -> [f64; 2] {
 #[test]
 fn a_globe_has_cells_and_entries_along_its_longitudes_and_says_that_it_is_made_up() {
     let folder = tempfile::tempdir().unwrap();
-    let settings = NetworkSettings { log2_table: 12, ..NetworkSettings::default() };
+    let settings = NetworkSettings { log2_table: Some(12), ..NetworkSettings::default() };
     let set = ["--set", "network.log2_table=12", "--set", "surrogate.kind=network", "--set", "training.steps_per_frame=1"];
     let scene = config("globe.toml");
     let run = ["replay", &scene, "--set", "time.slides=1", "--out", "run"];

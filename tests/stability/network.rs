@@ -12,7 +12,14 @@ use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, Samples, Surrogat
 use std::sync::Arc;
 
 fn settings(rate: Option<f32>) -> NetworkSettings {
-    NetworkSettings { levels: 4, log2_table: 10, width: 16, batch: 512, learning_rate: rate, ..NetworkSettings::default() }
+    NetworkSettings {
+        levels: Some(4),
+        log2_table: Some(10),
+        width: 16,
+        batch: Some(512),
+        learning_rate: rate,
+        ..NetworkSettings::default()
+    }
 }
 
 fn network(tracer: &DoubleGyre, rate: Option<f32>) -> HostSurrogate {

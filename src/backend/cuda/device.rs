@@ -1,7 +1,7 @@
 //! The CUDA implementation of [`Backend`]: plans the placement of a slide, and calls the GPU or the CPU accordingly.
 
 use super::driver::Gpu;
-use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu, seconds_of_prediction};
+use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu, seconds_of_prediction, trace_labels};
 use super::rendering::{CudaSamples, GpuFrames};
 use super::tracing::{CudaTracer, Tuning};
 use super::window::SnapshotStore;
@@ -323,6 +323,12 @@ impl Surrogate for CudaSurrogate {
     }
     fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError> {
         either!(CudaSurrogate, self, hybrid => hybrid.learn(buffer, seconds, max_steps))
+    }
+    fn trace_labels(&mut self, tracer: &CudaTracer, seed: u64, first: u64, count: usize) -> Result<bool, DeviceError> {
+        match self {
+            Self::Resident(hybrid) => trace_labels(hybrid, tracer, seed, first, count),
+            Self::OnHost(_) => Ok(false),
+        }
     }
     fn window_slid(&mut self, tracer: &CudaTracer, stop: &AtomicBool) -> Result<(), DeviceError> {
         match self {

@@ -80,7 +80,7 @@ impl Architecture {
             return Err(refused("inputs", found, &accepted));
         }
         let (levels, encoded) = match settings.encoding {
-            Encoding::HashGrid => (levels(settings, &inputs, lengths), settings.levels * settings.features),
+            Encoding::HashGrid => (levels(settings, &inputs, lengths), settings.levels() * settings.features),
             Encoding::Frequency => (Vec::new(), 2 * settings.octaves * inputs.len()),
         };
         let outputs = match settings.target {
@@ -171,11 +171,11 @@ impl Architecture {
 /// proportion, down to an eighth, so that cells are about as wide as high. A level whose nodes fit into the table is stored densely.
 fn levels(settings: &NetworkSettings, axes: &[usize], lengths: [f64; 3]) -> Vec<Level> {
     let longest = axes.iter().filter_map(|&axis| lengths.get(axis)).copied().fold(0.0, f64::max);
-    let capacity = 1_usize << settings.log2_table;
+    let capacity = 1_usize << settings.log2_table();
     let mut offset = 0;
-    (0..settings.levels)
+    (0..settings.levels())
         .map(|l| {
-            let resolution = settings.base_resolution as f64 * f64::from(settings.growth).powi(l as i32);
+            let resolution = settings.base_resolution() as f64 * f64::from(settings.growth()).powi(l as i32);
             let mut cells = [1_u32; GRID_INPUTS];
             for (slot, &axis) in axes.iter().enumerate() {
                 let share = match lengths.get(axis) {
@@ -201,7 +201,13 @@ mod tests {
 
     #[test]
     fn levels_are_dense_until_the_table_is_full() {
-        let settings = NetworkSettings { levels: 4, base_resolution: 8, growth: 2.0, log2_table: 10, ..NetworkSettings::default() };
+        let settings = NetworkSettings {
+            levels: Some(4),
+            base_resolution: Some(8),
+            growth: Some(2.0),
+            log2_table: Some(10),
+            ..NetworkSettings::default()
+        };
         let shape = Architecture::new(&settings, &[0, 1], [2.0, 1.0, 1.0]).unwrap();
         let cells: Vec<_> = shape.levels.iter().map(|l| (l.cells[0], l.cells[1], l.entries, l.hashed)).collect();
         assert_eq!(cells, [(8, 4, 45, false), (16, 8, 153, false), (32, 16, 561, false), (64, 32, 1024, true)]);
@@ -213,7 +219,7 @@ mod tests {
         let settings = NetworkSettings { features: 3, ..NetworkSettings::default() };
         let fault = Architecture::new(&settings, &[0, 1], [1.0; 3]).unwrap_err();
         assert_eq!(fault.to_string(), "setting network.features = 3 is not accepted; accepted: 1, 2, 4 or 8");
-        let settings = NetworkSettings { growth: f32::NAN, ..NetworkSettings::default() };
+        let settings = NetworkSettings { growth: Some(f32::NAN), ..NetworkSettings::default() };
         assert!(Architecture::new(&settings, &[0, 1], [1.0; 3]).is_err());
     }
 }

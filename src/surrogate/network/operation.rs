@@ -7,7 +7,7 @@
 //! use std::sync::Arc;
 //!
 //! type B = Autodiff<Flex>;
-//! let settings = NetworkSettings { levels: 4, log2_table: 8, width: 16, ..NetworkSettings::default() };
+//! let settings = NetworkSettings { levels: Some(4), log2_table: Some(8), width: 16, ..NetworkSettings::default() };
 //! let shape = Arc::new(Architecture::new(&settings, &[0, 1], [2.0, 1.0, 1.0]).unwrap());
 //! let network = Network::<B>::new(&shape, 0, false, &Default::default());
 //! let points = Tensor::<B, 2>::from_floats([[0.1, 0.2], [0.7, 0.4]], &Default::default());

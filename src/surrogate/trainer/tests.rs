@@ -87,7 +87,7 @@ fn labels() -> ReplayBuffer {
 }
 
 fn trainer<T: Training>(training: impl FnOnce(HostTraining) -> T) -> Trainer<T> {
-    let settings = NetworkSettings { levels: 2, log2_table: 8, width: 16, batch: 256, ..NetworkSettings::default() };
+    let settings = NetworkSettings { levels: Some(2), log2_table: Some(8), width: 16, batch: Some(256), ..NetworkSettings::default() };
     Trainer::new(&settings, &*tracer(), 1, false, |model| training(HostTraining::new(HostNetwork::fresh(model)))).unwrap()
 }
 

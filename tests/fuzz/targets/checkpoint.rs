@@ -53,7 +53,7 @@ fn checksum(tensors: &[u8]) -> String {
 impl Target {
     fn new() -> Self {
         let tracer = Still(Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0)));
-        let network = NetworkSettings { levels: 2, log2_table: 6, width: 16, batch: 256, ..NetworkSettings::default() };
+        let network = NetworkSettings { levels: Some(2), log2_table: Some(6), width: 16, batch: Some(256), ..NetworkSettings::default() };
         let settings = SurrogateSettings { kind: Kind::Residual, table_nodes: Some([5, 3, 1]), ..SurrogateSettings::default() };
         let surrogate = build(&settings, &network, &tracer.0, 5, &tracer).expect("a small surrogate");
         let path = std::env::temp_dir().join(format!("rw-fuzz-{}.safetensors", std::process::id()));

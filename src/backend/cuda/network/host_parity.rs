@@ -74,11 +74,11 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
 #[test]
 fn networks() {
     let usual = NetworkSettings {
-        levels: 3,
+        levels: Some(3),
         features: 2,
-        log2_table: 9,
-        base_resolution: 4,
-        growth: 2.0,
+        log2_table: Some(9),
+        base_resolution: Some(4),
+        growth: Some(2.0),
         octaves: 4,
         width: 16,
         target: Target::FlowMap,

@@ -462,7 +462,8 @@ mod tests {
     /// Each level is at the position that [`grid`] passes to the kernels.
     #[test]
     fn padded_tables_come_back_in_burn_s_order() {
-        let settings = NetworkSettings { levels: 4, log2_table: 9, base_resolution: 3, features: 2, ..NetworkSettings::default() };
+        let settings =
+            NetworkSettings { levels: Some(4), log2_table: Some(9), base_resolution: Some(3), features: 2, ..NetworkSettings::default() };
         let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
         assert!(shape.levels.iter().any(|level| level.entries % PADDING != 0) && shape.levels.iter().any(|level| level.hashed));
         let (_, padded) = grid(&shape).unwrap();

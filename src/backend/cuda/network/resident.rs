@@ -6,7 +6,7 @@ use super::samples::{Filled, SampleWriter, TracedBatch};
 use super::training::NetworkCopy as DeviceCopy;
 use super::{DeviceNetwork, DeviceSamples, DeviceTraining};
 use crate::DeviceError;
-use crate::cuda::driver::Gpu;
+use crate::cuda::driver::{Buffer, Gpu};
 use crate::cuda::layout::Outputs;
 use crate::cuda::rendering::{DeviceLearns, DevicePredict, HELD_BACK};
 use crate::cuda::tracing::{CudaTracer, DeviceTable};
@@ -14,8 +14,8 @@ use bytemuck::cast_slice;
 use ridgewatch_field::{Domain, UnitPoint};
 use ridgewatch_surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
 use ridgewatch_surrogate::{
-    BufferMark, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice, SurrogateTable, SyncedSamples,
-    Table, Training, fresh_stamp,
+    BufferMark, Download, FrozenHybrid, HostNetwork, HostTraining, Hybrid, Labels, NetworkCopy, SurrogateDevice, SurrogateTable,
+    SyncedSamples, Table, Training, fresh_stamp,
 };
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
@@ -118,6 +118,37 @@ pub(in crate::cuda) fn predict_from_host(
         values.read(out)?;
     }
     Ok(())
+}
+
+/// Traces uniform random points on the device and adds them to the labels there, as [`crate::Surrogate::trace_labels`] does.
+///
+/// # Errors
+/// The device fails or lacks memory.
+pub(in crate::cuda) fn trace_labels(
+    hybrid: &Hybrid<OnGpu>,
+    tracer: &CudaTracer,
+    seed: u64,
+    first: u64,
+    count: usize,
+) -> Result<bool, DeviceError> {
+    let frozen = hybrid.freeze()?;
+    let (base, network) = frozen_parts(&frozen)?;
+    let domain = tracer.host().domain();
+    let sink = network.and_then(|network| network.label_sink(domain, base, frozen.times));
+    let resident = hybrid.training().and_then(|training| training.resident.as_ref());
+    let (Some(sink), Some(resident), None) = (sink, resident, tracer.missing_cells()) else { return Ok(false) };
+    let gpu = tracer.device().gpu();
+    let mut points = gpu.alloc::<[f32; 3]>("points of labels", count)?;
+    let log_stretch = gpu.alloc::<f32>("labels", count)?;
+    let arrival = (sink.pool.writer.target() == Target::FlowMap).then(|| gpu.alloc::<[f32; 3]>("labels", count)).transpose()?;
+    resident.training.draw_points(domain, seed, first, &mut points)?;
+    let out = Outputs { log_stretch: log_stretch.address(), arrival: arrival.as_ref().map_or(0, Buffer::address), ..Outputs::default() };
+    // SAFETY: every buffer holds `count` entries and is freed in the order of the work stream.
+    unsafe {
+        tracer.device().trace(points.address(), count, &out)?;
+        sink.learn_from(points.address(), &out, count)?;
+    }
+    Ok(true)
 }
 
 /// A table on the GPU, with a copy on the host after the first download.
