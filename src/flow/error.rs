@@ -84,7 +84,8 @@ pub enum FlowError {
     },
     /// No number of steps meets the tolerance.
     #[error(
-        "{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}"
+        "{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch, FTLE times tau); \
+         tolerance {tolerance:.2e}"
     )]
     StepsNotFound {
         /// Largest number of steps tried.

@@ -216,7 +216,9 @@ fn traced_error(record: &FrameRecord) -> String {
     let Some(steps) = record.integration_steps else { return "FTLE traced with adaptive steps.".into() };
     let difference = match (record.integration_residual, record.integration_difference) {
         (Some(residual), _) => format!("; colours differ by {} % rms from those of many more", number(100.0 * residual)),
-        (None, Some(difference)) => format!("; the log-stretch differs by {} rms from that of twice as many", number(difference)),
+        (None, Some(difference)) => {
+            format!("; the log-stretch (FTLE times tau) differs by {} rms from that of twice as many", number(difference))
+        }
         (None, None) => String::new(),
     };
     format!("FTLE traced with {steps} steps{difference}.")

@@ -95,7 +95,8 @@ impl Run<'_> {
             record.gate_evidence = Some(evidence);
             if evidence >= REJECTED {
                 record.warnings.push(format!(
-                    "the error where the surrogate is trusted was above `trust.tolerance` over the last frames (evidence {evidence:.0}, limit {REJECTED}): every cell must earn trust again"
+                    "the error of the colours (optical residual) where the surrogate is trusted was above `trust.tolerance` over the last \
+                     frames (evidence {evidence:.0}, limit {REJECTED}): every cell must earn trust again"
                 ));
             }
         }

@@ -613,7 +613,7 @@ impl<B: Backend> Cycle<'_, B> {
         };
         if !chosen.within_tolerance {
             self.run.progress.warnings.push(format!(
-                "slide {}: the log-stretch with {} steps differs by {:.3} from that with twice as many",
+                "slide {}: the log-stretch (FTLE times tau) with {} steps differs by {:.3} from that with twice as many",
                 slide.index, chosen.steps, chosen.difference
             ));
         }
@@ -941,14 +941,15 @@ impl Run<'_> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
         if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(
-                "{} of {} paths of the step choice have no finite log-stretch: the integration overflowed there",
+                "{} of {} paths of the step choice have no finite log-stretch (FTLE times tau): the integration overflowed there",
                 chosen.not_finite,
                 StepChoice::POINTS
             ));
         }
         if let Some(chosen) = chosen.filter(|chosen| !chosen.within_tolerance) {
             warnings.push(format!(
-                "{} steps a path, the maximum, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                "{} steps a path, the maximum, still differ from twice as many by {:.3} in the log-stretch (FTLE times tau), root mean \
+                 square of the better 98 %",
                 chosen.steps, chosen.difference
             ));
         }

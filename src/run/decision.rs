@@ -66,7 +66,9 @@ pub(super) fn enter_colours(scene: &Settings, method: Method, chosen: TransferRe
 pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
     match residual {
         Some(residual) => format!("colours differ by {residual:.3} of their range, rms, from those of many more"),
-        None if difference.is_finite() => format!("the log-stretch differs by {difference:.3} rms from that of twice as many"),
+        None if difference.is_finite() => {
+            format!("the log-stretch (FTLE times tau) differs by {difference:.3} rms from that of twice as many")
+        }
         None => "no number of steps had a finite difference from twice as many".to_owned(),
     }
 }

@@ -141,7 +141,8 @@ impl Run<'_> {
         let size = low.abs().max(high.abs());
         (range <= error.max(UNIFORM) || high - low <= UNIFORM_SHARE * size).then(|| {
             format!(
-                "FTLE is uniform: colours have no range to scale to. The log-stretch varies by {range:.1e} over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
+                "FTLE is uniform: colours have no range to scale to. The log-stretch (FTLE times tau) varies by {range:.1e} \
+                 over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
             )
         })
     }

@@ -93,7 +93,7 @@ impl Sizing {
         let residual = (self.squares / f64::from(self.counted)).sqrt();
         (self.frames, self.squares, self.counted) = (0, 0.0, 0);
         let before = self.before_growth.take();
-        let state = format!("optical residual {residual:.4}, tolerance {tolerance:.4}");
+        let state = format!("error of the colours (optical residual) {residual:.4}, tolerance {tolerance:.4}");
         if residual > tolerance {
             if let Some(before) = before.filter(|before| residual > STILL_FALLS * before) {
                 self.most = self.size - 1;
