@@ -67,7 +67,7 @@ pub trait SnapshotSource: Send {
 
     /// A time as a date or, without a calendar, as a number.
     fn show(&self, time: f64) -> String {
-        self.date(time).unwrap_or_else(|| format!("{time} {}", self.describe().time_unit))
+        self.date(time).unwrap_or_else(|| format!("{time} {}", self.describe().time_unit).trim_end().to_owned())
     }
 
     /// Checks that the snapshots cover an integration over `tau`.
@@ -112,7 +112,7 @@ pub fn duration(value: f64, unit: &str) -> String {
     const HOUR: f64 = 3600.0;
     const DAY: f64 = 24.0 * HOUR;
     match value {
-        _ if unit != "s" || value < 2.0 * HOUR => format!("{value} {unit}"),
+        _ if unit != "s" || value < 2.0 * HOUR => format!("{value} {unit}").trim_end().to_owned(),
         _ if value < 2.0 * DAY => format!("{value} s ({:.1} hours)", value / HOUR),
         _ => format!("{value} s ({:.1} days)", value / DAY),
     }

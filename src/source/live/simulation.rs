@@ -65,7 +65,11 @@ impl Live {
     /// Description for the user.
     pub fn describe(&self) -> String {
         let [x, y, z] = self.description.shape();
-        format!("{x} x {y} x {z} nodes in {} block(s), time in {}", self.description.block.count, self.description.time_unit)
+        let unit = match self.time_unit() {
+            "" => "time without a unit".to_owned(),
+            unit => format!("time in {unit}"),
+        };
+        format!("{x} x {y} x {z} nodes in {} block(s), {unit}", self.description.block.count)
     }
 }
 

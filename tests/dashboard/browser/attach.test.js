@@ -40,6 +40,7 @@ test("a running simulation is followed, its loss is told within 5 s, and its res
   const first = await step();
   await until("later steps", async () => await step() > first + 3);
   assert.match(await sentence(), /behind the simulation/);
+  assert.equal(await page.textContent("#source"), "a running simulation, 48 x 24 x 24 nodes in 1 block(s), time without a unit");
   // The lag is that of the record.
   const { live } = records().at(-1);
   assert.ok(live.delay >= 0 && live.delay < 5, `${live.delay} s`);
