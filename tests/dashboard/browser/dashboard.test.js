@@ -4,10 +4,9 @@ import { mkdirSync } from "node:fs";
 import path from "node:path";
 import { after, afterEach, before, beforeEach, test } from "node:test";
 import { WebSocket } from "ws";
-import { MESSAGE_LIMIT, Proxy, TOKEN, compose, launch, parse, startDashboard, startPublisher, stop, temporary, until } from "./kit.js";
+import { MESSAGE_LIMIT, PREFIX, Proxy, TOKEN, compose, launch, parse, startDashboard, startPublisher, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
-const PREFIX = "/node/compute-17/8577/";
 
 const folder = temporary();
 const endpoint = `ipc://${folder}/frames`;

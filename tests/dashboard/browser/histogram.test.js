@@ -4,9 +4,11 @@ import { mkdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { axisOf, moved } from "../../../src/dashboard/page/histogram.js";
-import { TOKEN, launch, startDashboard, startShown, stop, temporary, until } from "./kit.js";
+import { TOKEN, apart, launch, shownPicture, startDashboard, startShown, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
+// trust.audit_min_per_cell in each of trust.cells.
+const AUDITED = 8 * 16 ** 3;
 const folder = temporary();
 let browser;
 let shown;
@@ -71,8 +73,11 @@ test("an axis has the values and the ramp, and its ends stay apart", () => {
   assert.deepEqual(moved({ low: 2e-7, high: 8e-7 }, "high", 6.1234567e-7, { low: 0, high: 1e-6 }), { low: 2e-7, high: 6.12e-7 });
 });
 
-test("a handle that is dragged changes the range of a later record, and traces no slide anew", async () => {
+test("a handle that is dragged changes the range of a later record and its picture, and traces no slide anew", async () => {
   const page = await opened();
+  // Two pictures of the same colours, which only noise tells apart.
+  const first = await shownPicture(page);
+  const before = await until("a later picture", async () => { const picture = await shownPicture(page); return picture.frame > first.frame + 3 && picture; });
   const { frame, transfer } = records().at(-1);
   const [x, y] = await middle(page, "high");
   const plot = await page.locator("#histogram-plot").boundingBox();
@@ -86,8 +91,14 @@ test("a handle that is dragged changes the range of a later record, and traces n
   const record = await shownBy(frame, chosen);
   const later = records().filter(({ frame: number }) => number > frame && number <= record.frame);
   assert.ok(later.some(({ commands }) => commands.some(({ set }) => set.transfer?.high === chosen.high)));
-  // Frames trace their own audit points, and the slide is not prepared anew.
+  const after = await until("its picture", async () => { const picture = await shownPicture(page); return picture.frame >= record.frame && picture; });
+  const [noise, change] = [apart(first, before), apart(before, after)];
+  assert.ok(change > 3 * noise && change > 0.5, `levels change by ${change}, with the same colours by ${noise}`);
+  // The slide is not prepared anew, and trust begins anew: a frame of other colours traces 8 audit points in each of the 16^3 cells, as any frame, and none
+  // that a trusted cell gets besides.
   assert.ok(later.every(({ slide, preparation_traces: traced }) => slide === 0 && traced === 0), JSON.stringify(later));
+  const audited = later.filter(({ commands }) => commands.some(({ set }) => set.transfer)).map((record) => record.audited);
+  assert.deepEqual([...new Set(audited)], [AUDITED]);
   assert.ok(records()[0].preparation_traces > 0);
   await until("the field shows it", async () => Number(await page.inputValue("#high")) === Number(chosen.high.toPrecision(6)));
   await page.screenshot({ path: path.join(SCREENSHOTS, "histogram.png") });

@@ -18,6 +18,8 @@ const FLAGS = [
 ];
 // jupyter-server-proxy's clients accept messages of this length.
 export const MESSAGE_LIMIT = 10_000_000;
+// A path as Open OnDemand puts before a page.
+export const PREFIX = "/node/compute-17/8577/";
 export const TOKEN = "a-token-of-the-tests-0123456789abcdef";
 
 // Small pictures, several a second, so that silence is noticed within its shortest limit.
@@ -70,10 +72,21 @@ const printedUrl = (child) => until("an address is printed", () => {
   return /"url":\s*"([^"]+)"/.exec(child.text)?.[1];
 });
 
-/** A run that shows itself, and the address of its page. */
+/** A proxy with a path prefix before the page of a program, with which it ends. */
+export async function startProxy(child, port) {
+  const proxy = new Proxy(PREFIX);
+  await proxy.listen();
+  proxy.target = port;
+  child.once("exit", () => proxy.close());
+  return proxy;
+}
+
+/** A run that shows itself, and the address of its page behind a proxy. */
 export async function startShown(folder, { more = [], ...options } = {}) {
   const child = startPublisher(`ipc://${folder}/frames`, folder, { ...options, more: ["--dashboard=0", "--json", ...more] });
-  return { child, url: await printedUrl(child) };
+  const { port, searchParams } = new URL(await printedUrl(child));
+  const proxy = await startProxy(child, Number(port));
+  return { child, url: proxy.address(searchParams.get("token")) };
 }
 
 /** A simulation that steps four times a second. */
@@ -125,11 +138,16 @@ export class Proxy {
   pass(request, response) {
     if (!request.url.startsWith(this.prefix)) { response.writeHead(404).end(); return; }
     const { method, headers, url } = request;
-    const upstream = http.request({ port: this.target, host: "127.0.0.1", path: url, method, headers }, (answer) => {
+    const upstream = http.request({ port: this.target, host: "127.0.0.1", path: url, method, headers: { ...headers, connection: "close" } }, (answer) => {
       response.writeHead(answer.statusCode, answer.headers);
       answer.pipe(response);
     });
-    upstream.on("error", () => response.writeHead(502).end());
+    upstream.on("error", () => {
+      if (!response.headersSent) response.writeHead(502);
+      response.end();
+    });
+    // Who gives up does so all the way.
+    response.on("close", () => upstream.destroy());
     request.pipe(upstream);
   }
 
@@ -177,6 +195,18 @@ export async function until(what, probe, milliseconds = 20_000) {
     await new Promise((resolve) => setTimeout(resolve, 50));
   }
 }
+
+/** The number of the frame that the page shows, and its pixels. Read from a copy, since browsers warn of canvases that are read often. */
+export const shownPicture = (page) => page.evaluate(() => {
+  const canvas = document.getElementById("frame");
+  const context = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+  context.drawImage(canvas, 0, 0);
+  const frame = Number(document.getElementById("position").textContent.replace(/\D/g, ""));
+  return { frame, data: [...context.getImageData(0, 0, canvas.width, canvas.height).data] };
+});
+
+/** Mean difference of the levels of two pictures. */
+export const apart = ({ data: a }, { data: b }) => a.reduce((sum, level, k) => sum + Math.abs(level - b[k]), 0) / a.length;
 
 /** Channels of a picture as the program writes it (openexr.com, "OpenEXR File Layout": one part, 32-bit floats, ZIP): its width, and by name values in rows. */
 export function readExr(bytes) {

@@ -3,7 +3,8 @@ import assert from "node:assert/strict";
 import { mkdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
-import { launch, startShown, stop, temporary, until } from "./kit.js";
+import { valueWords } from "../../../src/dashboard/page/values.js";
+import { launch, readExr, startShown, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 const folder = temporary();
@@ -113,6 +114,34 @@ test("a map says its values, seeds and error, and is saved as a field", async ()
   await page.context().close();
 });
 
+test("the value of a pixel is that of the frame's EXR", async () => {
+  const page = await open(map.url);
+  await until("the controls", () => page.isVisible("#pause"));
+  await page.click("#pause");
+  const shown = async () => Number((await page.textContent("#position")).replace(/\D/g, ""));
+  let frame = -1;
+  await until("no more frames", async () => { const is = await shown(); const same = is === frame; frame = is; await page.waitForTimeout(2_500); return same; }, 60_000);
+  const [file] = await Promise.all([page.waitForEvent("download"), page.click('[data-save="exr"]')]);
+  assert.match(file.suggestedFilename(), new RegExp(`^run-frame-${String(frame).padStart(6, "0")}-`));
+  const { width, channels } = readExr(readFileSync(await file.path()));
+  assert.equal(width, 320);
+  const box = await page.locator("#frame").boundingBox();
+  const told = [];
+  for (const [x, y] of [[107, 40], [40, 107], [300, 12]]) {
+    await page.mouse.move(box.x + ((x + 0.5) / 320) * box.width, box.y + ((y + 0.5) / 160) * box.height);
+    await until("its value", async () => (await page.textContent("#values")).startsWith(`frame ${frame.toLocaleString("en-GB")} at ${x}, ${y}: FTLE `));
+    told.push(await page.textContent("#values"));
+    const of = Object.fromEntries(Object.entries(channels).map(([name, values]) => [name, values[y * width + x]]));
+    assert.equal(told.at(-1), valueWords({ frame, x, y, channels: of, method: "map" }));
+    const [, ftle, error] = /FTLE (\S+) ± (\S+)$/.exec(told.at(-1)).map((text) => Number(text.replaceAll("−", "-")));
+    assert.ok(Math.abs(ftle / of["ftle.mean"] - 1) < 0.005 && Math.abs(error / of.error - 1) < 0.05, `${told.at(-1)}, not ${of["ftle.mean"]} and ${of.error}`);
+  }
+  assert.equal(new Set(told.map((text) => text.split(": ")[1])).size, 3, "values of different pixels");
+  await page.click("#pause");
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
 test("a picture that stands is drawn without the losses of JPEG", async () => {
   const page = await open(map.url);
   await until("the controls", () => page.isVisible("#pause"));
@@ -122,7 +151,7 @@ test("a picture that stands is drawn without the losses of JPEG", async () => {
   await until("a picture without loss", async () => /, png$/.test(await form()), 60_000);
   // Viridis has no grey: of the colours of JPEG many are none of its own.
   const address = new URL(map.url);
-  address.pathname = "/frame.png";
+  address.pathname += "frame.png";
   const differing = await page.$eval("#frame", async (canvas, url) => {
     const bitmap = await createImageBitmap(await (await fetch(url)).blob());
     const pixels = (source) => {

@@ -55,7 +55,7 @@ const shownNow = (page) => page.evaluate(() => ({
 /** The channel of these pixels of a frame, and null if the run keeps another frame by now. */
 async function channels(name, frame, pixels) {
   const address = new URL(shown.url);
-  address.pathname = "/values";
+  address.pathname += "values";
   const values = [];
   for (const [x, y] of pixels) {
     for (const [key, value] of Object.entries({ x, y, frame })) address.searchParams.set(key, value);

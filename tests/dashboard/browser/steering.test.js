@@ -4,13 +4,15 @@ import { mkdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, beforeEach, test } from "node:test";
 import { WebSocket } from "ws";
-import { TOKEN, launch, parse, startDashboard, startPublisher, stop, temporary, until } from "./kit.js";
+import { TOKEN, apart, launch, parse, shownPicture, startDashboard, startProxy, startPublisher, stop, temporary, until } from "./kit.js";
 
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 // Of a box, and of a map.
 const box = { "time.frames_per_slide": 100_000, "time.warmup_frames": 0, "surrogate.table_nodes": "[17, 17, 17]", "flow.steps": 20 };
 const map = { "camera.orthographic": true };
 const scenes = { box: { scene: "configs/abc.toml", changes: box }, map: { scene: "configs/double_gyre.toml", changes: map } };
+// trust.audit_min_per_cell in each of trust.cells.
+const AUDITED = 8 * 16 ** 3;
 const stages = {};
 let browser;
 
@@ -19,8 +21,9 @@ async function stage(name, options) {
   const [endpoint, commands] = [`ipc://${folder}/frames`, `${folder}/commands`];
   const publisher = startPublisher(endpoint, folder, { ...options, more: [`--steer=ipc://${commands}`] });
   const dashboard = await startDashboard(endpoint, folder, 0, TOKEN, [`--steer=${commands}.connection`]);
+  const proxy = await startProxy(dashboard.child, dashboard.port);
   const records = () => readFileSync(path.join(folder, "run/records.jsonl"), "utf8").split("\n").slice(0, -1).map((line) => JSON.parse(line));
-  stages[name] = { folder, endpoint, publisher, dashboard, records, address: (token) => `http://127.0.0.1:${dashboard.port}/?token=${token}` };
+  stages[name] = { folder, endpoint, publisher, dashboard, records, address: (token) => proxy.address(token) };
 }
 
 before(async () => {
@@ -218,17 +221,26 @@ test("a range of colours is in a later record, and on the colour bar", async () 
   });
 });
 
-test("other colours change the picture, and nothing is traced anew for them", async () => {
+test("a transfer function edit changes the picture, and traces no points but the audit points of its own frame", async () => {
   await steered("box", async (page, where) => {
+    // Two pictures of the same colours, which only noise tells apart.
+    const first = await shownPicture(page);
+    const before = await until("a later picture", async () => { const picture = await shownPicture(page); return picture.frame > first.frame + 3 && picture; });
     const { frame, slide, transfer } = newest(where);
-    await page.fill("#high", String(1.5 * transfer.high));
+    const high = (transfer.low + transfer.high) / 2;
+    await page.fill("#high", String(high));
     await page.press("#high", "Enter");
     const record = await commanded(where, frame, ["transfer"]);
-    const before = where.records().find((other) => other.frame === record.frame - 1);
-    assert.ok(Math.abs(record.transfer.high / transfer.high - 1.5) < 1e-9 && record.slide === slide);
-    // What was audited before counts under the new colours: each frame has its own share of audit points, and no more.
+    assert.ok(record.transfer.high === high && record.slide === slide);
+    const after = await until("its picture", async () => { const picture = await shownPicture(page); return picture.frame >= record.frame && picture; });
+    const [noise, change] = [apart(first, before), apart(before, after)];
+  assert.ok(change > 3 * noise && change > 0.5, `levels change by ${change}, with the same colours by ${noise}`);
+    // Had the slide been traced anew, there were points before the frame. Trust begins anew: 8 points in each of the 16^3 cells, as of any frame, and none
+    // that a trusted cell gets besides.
     assert.equal(record.preparation_traces, 0);
-    assert.ok(record.audited <= 1.5 * before.audited, `${record.audited} after ${before.audited}`);
+    assert.equal(record.audited, AUDITED);
+    const former = where.records().find((other) => other.frame === record.frame - 1);
+    assert.ok(former.trusted_volume > 0 && former.audited >= AUDITED, `${former.audited} points before`);
   });
 });
 
