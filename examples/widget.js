@@ -3,11 +3,22 @@ const DASH = "–";
 const percent = (share) => (Number.isFinite(share) ? `${(100 * share).toPrecision(3)} %` : DASH);
 const decibels = (value) => (Number.isFinite(value) ? `${value.toFixed(1)} dB` : DASH);
 
-function words({ frame, slide, time, time_unit: unit, date, picture_error: error, traced_share: traced, device }) {
+const SURROGATES = { table: "a table", network: "a network", residual: "a table with a network" };
+
+/** What was traced for a picture. Where a surrogate draws it, all that is traced corrects it or measures its error, and a share of it tells nothing. */
+function tracedWords({ method, surrogate, traced, traced_share: share, picture_error: error }) {
+  const drawn = `drawn by ${SURROGATES[surrogate] ?? "a surrogate"}`;
+  if (method === "two_level") return `${drawn} and corrected with ${traced ?? DASH} traced points`;
+  if (method === "marched") return `${drawn}, uncorrected: ${traced ?? DASH} traced points only measure its error`;
+  return method === "map" ? `${error?.samples_per_pixel?.toFixed(0) ?? DASH} seeds a pixel` : `${percent(share)} traced`;
+}
+
+function words(record) {
+  const { frame, slide, time, time_unit: unit, date, picture_error: error, device } = record;
   if (frame === undefined) return "";
   const when = date ?? `t = ${time} ${unit ?? ""}`.trim();
   const stated = error ? `error ${percent(error.rms?.value)} rms, ${decibels(error.psnr?.value)}` : "no error stated";
-  return `frame ${frame}, slide ${slide}, ${when}; ${stated}; ${percent(traced)} traced; ${device ?? DASH}`;
+  return `frame ${frame}, slide ${slide}, ${when}; ${stated}; ${tracedWords(record)}; ${device ?? DASH}`;
 }
 
 function render({ model, el }) {

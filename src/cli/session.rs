@@ -425,6 +425,9 @@ pub fn line(record: &FrameRecord) -> String {
         "gated" if record.traced_share >= NOTHING_SAVED => {
             format!("the surrogate saved nothing: {:.1} % of {queries} queries were traced", 100.0 * record.traced_share)
         }
+        // All that these trace is traced, whatever drew the picture.
+        "two_level" => format!("drawn by {} and corrected with {} traced points", drawn_by(record), record.traced),
+        "marched" => format!("drawn by {}, uncorrected: {} traced points only measure its error", drawn_by(record), record.traced),
         _ => format!("traced {:.1} % of {queries} queries", 100.0 * record.traced_share),
     };
     if record.missing > 0 {
@@ -452,6 +455,16 @@ pub fn line(record: &FrameRecord) -> String {
     text + &format!(", {:.2} s", record.seconds.total)
 }
 
+/// What draws the picture of a smooth method.
+fn drawn_by(record: &FrameRecord) -> &'static str {
+    match record.surrogate.as_deref() {
+        Some("table") => "a table",
+        Some("network") => "a network",
+        Some("residual") => "a table with a network",
+        _ => "a surrogate",
+    }
+}
+
 fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
     let serde_json::Value::Object(map) = serde_json::json!({
         "frames": report.frames,
@@ -477,4 +490,31 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         unreachable!("an object literal")
     };
     map
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_names_what_drew_the_picture_and_what_was_traced() {
+        let told = |method: &str, surrogate: Option<&str>, traced: u64| {
+            let record = FrameRecord {
+                method: method.into(),
+                surrogate: surrogate.map(Into::into),
+                queries: 2552,
+                traced,
+                traced_share: traced as f64 / 2552.0,
+                ..FrameRecord::default()
+            };
+            line(&record)
+        };
+        let table = Some("table");
+        assert_eq!(told("two_level", table, 2552), "t = 0, drawn by a table and corrected with 2552 traced points, 0.00 s");
+        let marched = "t = 0, drawn by a table with a network, uncorrected: 2552 traced points only measure its error, 0.00 s";
+        assert_eq!(told("marched", Some("residual"), 2552), marched);
+        assert_eq!(told("gated", Some("network"), 319), "t = 0, traced 12.5 % of 2552 queries, 0.00 s");
+        assert_eq!(told("gated", table, 2552), "t = 0, the surrogate saved nothing: 100.0 % of 2552 queries were traced, 0.00 s");
+        assert_eq!(told("reference", None, 2552), "t = 0, traced 100.0 % of 2552 queries, 0.00 s");
+    }
 }

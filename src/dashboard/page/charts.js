@@ -1,7 +1,7 @@
 // Charts over the frames, with one cursor for all.
 import uPlot from "./vendor/uPlot.esm.js";
 import { termButton } from "./terms.js";
-import { DASH, lag, number, percent, shareOfPeak } from "./words.js";
+import { DASH, lag, number, percent, shareOfPeak, surrogateError, tracedShare } from "./words.js";
 
 const STAGES = ["render", "trace", "predict", "audit", "train", "checkpoint", "slide", "refine"];
 const COLOURS = ["--blue", "--orange", "--green", "--purple", "--vermillion", "--sky", "--yellow", "--muted"];
@@ -11,17 +11,21 @@ const pick = (value) => (Number.isFinite(value) ? value : null);
 /** The numbers of a record that the charts show. */
 export function rowOf(record) {
   const { picture_error: picture, trusted_error: trusted, seconds, live } = record;
+  const error = pick(surrogateError(record));
+  // The interval is that of the trusted region.
+  const [low, high] = error === trusted?.optical_rms ? (trusted.optical_rms_interval ?? []) : [];
   const row = {
     frame: record.frame,
     elapsed: pick(seconds?.elapsed),
     psnr: pick(picture?.psnr?.value),
     psnrLow: pick(picture?.psnr?.low),
     psnrHigh: pick(picture?.psnr?.high),
-    trusted: pick(trusted?.optical_rms),
-    trustedLow: pick(trusted?.optical_rms_interval?.[0]),
-    trustedHigh: pick(trusted?.optical_rms_interval?.[1]),
-    tolerance: trusted ? pick(record.tolerance) : null,
-    traced: pick(record.traced_share),
+    surrogate: error,
+    surrogateLow: pick(low),
+    surrogateHigh: pick(high),
+    // Without a surrogate there is nothing to allow, whatever is trusted.
+    tolerance: record.surrogate ? pick(record.tolerance) : null,
+    traced: tracedShare(record),
     loss: pick(record.training?.loss),
     time: live ? pick(record.time) : null,
     lag: pick(lag(record)),
@@ -44,14 +48,14 @@ const CHARTS = [
     bands: [[3, 2]],
   },
   {
-    title: "Error where trusted, and tolerance", term: "tolerance", needs: "trusted", floor: 0, share: true,
+    title: "Error of the surrogate, and tolerance", term: "surrogate_error", needs: "tolerance", floor: 0, share: true,
     series: [
-      line("trusted", "error, rms", "--orange", percent), ...interval("trustedLow", "trustedHigh", "--orange", percent),
+      line("surrogate", "error, rms", "--orange", percent), ...interval("surrogateLow", "surrogateHigh", "--orange", percent),
       line("tolerance", "tolerance", "--vermillion", percent, { dash: [6, 4] }),
     ],
     bands: [[3, 2]],
   },
-  { title: "Share traced", term: "traced", floor: 0, ceiling: 1, share: true, series: [line("traced", "traced", "--green", percent)] },
+  { title: "Share traced", term: "traced", needs: "traced", floor: 0, ceiling: 1, share: true, series: [line("traced", "traced", "--green", percent)] },
   {
     title: "Frame time by stage", floor: 0, unit: "s", stacked: true,
     series: STAGES.map((stage, index) => line(stage, stage, COLOURS[index], seconds, { width: 0 })),
@@ -153,15 +157,15 @@ export class Charts {
     return figure;
   }
 
-  size() {
-    const shown = [...this.figures.values()].find((figure) => !figure.hidden);
-    return { width: Math.max(200, Math.floor(shown?.clientWidth ?? 0)), height: Math.round(parseFloat(getComputedStyle(this.root).getPropertyValue("--height")) * rem()) };
+  /** Size of the plot in a figure. */
+  size(figure) {
+    return { width: Math.max(200, Math.floor(figure.clientWidth)), height: Math.round(parseFloat(getComputedStyle(this.root).getPropertyValue("--height")) * rem()) };
   }
 
   plot(spec) {
     const showCurrent = (plot) => { if (plot.cursor.idx == null && this.rows.length > 0) plot.setLegend({ idx: this.current() }, false); };
     const options = {
-      ...this.size(),
+      ...this.size(this.figures.get(spec)),
       cursor: { sync: { key: "frames" }, drag: { x: false, y: false }, points: { size: 7 } },
       scales: { x: { time: false }, y: yScale(spec), ...(spec.series.some((series) => series.scale) ? { time: { range: range({}) } } : {}) },
       series: [{ label: "frame", value: (_, value) => (value === null ? DASH : number(value, 9)) }, ...seriesOptions(spec, () => this.rows)],
@@ -199,13 +203,15 @@ export class Charts {
   /** Draws the rows. */
   update(rows) {
     this.rows = rows.slice();
-    for (const spec of CHARTS) this.updateOne(spec);
+    const shown = CHARTS.filter(({ needs }) => this.rows.length > 0 && (needs === undefined || this.rows.some((row) => row[needs] !== null)));
+    const changed = CHARTS.filter((spec) => this.figures.get(spec).hidden === shown.includes(spec));
+    for (const spec of changed) this.figures.get(spec).hidden = !shown.includes(spec);
+    for (const spec of shown) this.updateOne(spec);
+    // Others may have more or less room now.
+    if (changed.length > 0) this.resize();
   }
 
   updateOne(spec) {
-    const figure = this.figures.get(spec);
-    figure.hidden = this.rows.length === 0 || (spec.needs !== undefined && this.rows.every((row) => row[spec.needs] === null));
-    if (figure.hidden) return;
     if (!this.plots.has(spec)) this.plots.set(spec, this.plot(spec));
     else this.plots.get(spec).setData(columns(spec, this.rows));
   }
@@ -221,7 +227,7 @@ export class Charts {
   }
 
   resize() {
-    for (const plot of this.plots.values()) plot.setSize(this.size());
+    for (const [spec, plot] of this.plots) if (!this.figures.get(spec).hidden) plot.setSize(this.size(this.figures.get(spec)));
   }
 
   /** Takes over the colours of another theme. */

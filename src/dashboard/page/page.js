@@ -9,7 +9,7 @@ import { Overlay } from "./overlay.js";
 import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
-import { explainTerms } from "./terms.js";
+import { explainTerms, explained } from "./terms.js";
 import { Values, address as fileAddress, asker, download, downloadField, fieldCommand, histogramAsker, pictureAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
@@ -60,6 +60,8 @@ let server = null;
 let heard = null;
 let chartsDue = false;
 let logVersion = -1;
+// The items of the log, by entry; what changes is another entry.
+const logItems = new WeakMap();
 let announced = { kind: null, at: 0 };
 
 // Messages
@@ -210,24 +212,26 @@ function conditionItem({ id, level, text, tick }) {
     item.lastChild.ariaHidden = "true";
   }
   item.className = level;
-  setText(item.firstChild, text);
+  if (item.firstChild.textContent !== text) item.firstChild.replaceChildren(...explained(text));
   setText(item.lastChild, tick ?? "");
   return item;
 }
 
-function showConditions(conditions) {
-  const list = element("warnings");
-  const items = conditions.map(conditionItem);
+/** Makes these the items of a list. Those that stay are left alone, and keep the focus. */
+function arrange(list, items) {
   for (const old of [...list.children]) if (!items.includes(old)) old.remove();
   items.forEach((item, index) => { if (list.children[index] !== item) list.insertBefore(item, list.children[index] ?? null); });
 }
 
-function logItem({ text, times, frame, at }) {
+function logItem(entry) {
+  const { text, times, frame, at } = entry;
+  if (logItems.has(entry)) return logItems.get(entry);
   const item = document.createElement("li");
   const when = document.createElement("time");
   when.dateTime = at.toISOString();
   when.textContent = at.toLocaleTimeString("en-GB");
-  item.append(when, ` ${frame === null ? "" : `frame ${count(frame)}: `}${text}${times > 1 ? ` (${count(times)} times)` : ""}`);
+  item.append(when, ` ${frame === null ? "" : `frame ${count(frame)}: `}`, ...explained(text), times > 1 ? ` (${count(times)} times)` : "");
+  logItems.set(entry, item);
   return item;
 }
 
@@ -236,7 +240,7 @@ function showLog() {
   logVersion = warnings.log.version;
   const entries = warnings.log.newestFirst();
   setText(element("message-count"), String(entries.length));
-  element("log").replaceChildren(...entries.map(logItem));
+  arrange(element("log"), entries.map(logItem));
 }
 
 function announce(kind, text) {
@@ -254,7 +258,7 @@ function showState() {
   element("state").dataset.kind = kind;
   setText(element("source"), newest?.source ?? "");
   announce(kind, text);
-  showConditions(warnings.conditions(view));
+  arrange(element("warnings"), warnings.conditions(view).map(conditionItem));
   const stale = STALE.includes(kind) && picture.shown !== null && !picture.held;
   element("stage").classList.toggle("stale", stale);
   element("age").hidden = !stale;

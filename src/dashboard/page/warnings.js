@@ -9,6 +9,7 @@ const FRESH = 5;
 // Said with the first frame of each slide of which it is true.
 const COARSE_IN_TIME = /\bcoarse in time\b/;
 const LOST_SIMULATION = /\bsimulation (is gone|has ended)\b/;
+const UNTRUSTED = "The surrogate is trusted nowhere yet: in no part of the domain is its measured error within the tolerance";
 
 /** Messages, newest first; those that differ in numbers only are one entry with a count. */
 export class Log {
@@ -45,6 +46,7 @@ export class Warnings {
     this.live = null;
     this.lostAtStep = null;
     this.coarse = null;
+    this.untrusted = null;
   }
 
   /** Tells of something now, and logs it. `id` is one of a few. */
@@ -60,7 +62,7 @@ export class Warnings {
 
   readOne(record, fresh) {
     const { frame, tolerance_excess: excess, over_budget: overBudget, checkpoint } = record;
-    if (excess > 0) this.hold("tolerance", `Error above the tolerance by ${number(excess)} (optical residual, rms)`, frame, fresh);
+    if (excess > 0) this.hold("tolerance", `Error of the colours (optical residual) above the tolerance by ${number(excess)}, rms`, frame, fresh);
     if (overBudget > 0) {
       this.hold("budget", `Tracing budget spent: ${count(overBudget)} queries in untrusted cells were answered by the surrogate`, frame, fresh);
     }
@@ -68,6 +70,7 @@ export class Warnings {
     const warnings = Array.isArray(record.warnings) ? record.warnings.map(String) : [];
     this.readWarnings(warnings, frame, fresh);
     this.readCoarse(record.slide, warnings.find((text) => COARSE_IN_TIME.test(text)));
+    this.readTrust(record);
     if (record.live) this.readLive(record, fresh);
   }
 
@@ -80,6 +83,13 @@ export class Warnings {
   readCoarse(slide, text) {
     if (text !== undefined) this.coarse = { slide, text };
     else if (this.coarse !== null && slide !== this.coarse.slide) this.coarse = null;
+  }
+
+  /** Of the method that traces where the surrogate is not trusted. Holds until something is trusted, and is logged once. */
+  readTrust({ frame, method, trusted_error: trusted, traced_share: share }) {
+    if (method !== "gated" || trusted !== null) { this.untrusted = null; return; }
+    if (this.untrusted === null) this.log.add(UNTRUSTED, frame);
+    this.untrusted = share === 1 ? `${UNTRUSTED}, so that all is traced` : UNTRUSTED;
   }
 
   readLive({ live, frame, warnings }, fresh) {
@@ -106,6 +116,7 @@ export class Warnings {
       found.push({ id: "simulation", level: "critical", text: "The simulation has ended or is gone. The picture shows its last steps." });
     }
     if (this.coarse !== null) found.push({ id: "time", level: "warning", text: `Too ${this.coarse.text}` });
+    if (this.untrusted !== null) found.push({ id: "untrusted", level: "warning", text: this.untrusted });
     for (const [id, { text, until }] of this.held) {
       if (until > now) found.push({ id, level: id === "tolerance" ? "critical" : "warning", text });
       else this.held.delete(id);

@@ -40,11 +40,25 @@ export function lag(record) {
   return known(age) ? age + (record.seconds?.total ?? 0) : null;
 }
 
+const overBudget = (record) => record.over_budget > 0;
+
+/**
+ * Root mean square of the optical residual where the surrogate answered; null if unknown. Where it also answered untrusted queries, since the tracing budget was
+ * spent, the record tells by how much their error is above the tolerance: an error within it counts as large as that.
+ */
+export function surrogateError(record) {
+  const { tolerance, tolerance_excess: excess, trusted_error: trusted } = record;
+  const untrusted = overBudget(record) && known(tolerance) && known(excess) ? tolerance + excess : null;
+  const errors = [trusted?.optical_rms, untrusted].filter(known);
+  return errors.length > 0 ? Math.max(...errors) : null;
+}
+
 function errorWords(record) {
   const psnr = record.picture_error?.psnr?.value;
   if (known(psnr)) return `error ${percent(shareOfPeak(psnr))} (${number(psnr, 2)} dB)`;
-  const trusted = record.trusted_error?.optical_rms;
-  return known(trusted) ? `error where trusted ${percent(trusted)}, of the picture unknown` : "error unknown";
+  const error = surrogateError(record);
+  const where = overBudget(record) ? "where the surrogate answered" : "where trusted";
+  return known(error) ? `error ${where} ${percent(error)}, of the picture unknown` : "error unknown";
 }
 
 function lagWords(record) {
@@ -61,8 +75,26 @@ function seedWords({ picture_error: error }) {
   return known(error?.samples_per_pixel) ? `${count(error.samples_per_pixel)} seeds a pixel` : null;
 }
 
+const SURROGATES = { table: "a table", network: "a network", residual: "a table with a network" };
+
+/** What drew the picture, and what was traced for it, of methods whose picture is the surrogate's; null of others. Of what they trace a share tells nothing: it is all of it. */
+function drawnWords({ method, surrogate, traced }) {
+  const drawn = `drawn by ${SURROGATES[surrogate] ?? "a surrogate"}`;
+  const points = known(traced) ? `${count(traced)} traced points` : "traced points";
+  if (method === "two_level") return `${drawn} and corrected with ${points}`;
+  return method === "marched" ? `${drawn}, uncorrected: ${points} only measure its error` : null;
+}
+
+// Methods that trace all queries of their picture, or none.
+const SHARE_IS_FIXED = new Set(["map", "reference", "surrogate", "marched", "two_level"]);
+
+/** Share of the queries that was traced; null if it is unknown, and of methods of which it tells nothing. */
+export const tracedShare = ({ method, traced_share: share }) => (known(share) && !SHARE_IS_FIXED.has(method) ? share : null);
+
 function tracedWords(record) {
   if (record.method === "map") return seedWords(record);
+  const drawn = drawnWords(record);
+  if (drawn !== null) return drawn;
   const share = record.traced_share;
   if (!known(share)) return "share traced unknown";
   const saved = record.method === "gated" && share >= NOTHING_SAVED;
@@ -71,7 +103,7 @@ function tracedWords(record) {
 
 const stepWords = (record) => (record.live ? `step ${count(record.live.step)}` : null);
 
-/** Frame, slide, step of the simulation, time, lag, error and share traced of a record. */
+/** Frame, slide, step of the simulation, time, lag, error and what was traced of a record. */
 export function frameWords(record) {
   const when = record.date ? `t = ${record.date}` : `t = ${time(record.time, record.time_unit)}`;
   const state = [lagWords(record), errorWords(record), tracedWords(record)];
@@ -113,7 +145,7 @@ export function facts(record, header) {
     device: record.device || DASH,
     size: `${record.size?.join(" × ") ?? DASH} pixels, ${(record.method === "map" && seedWords(record)) || `${number(record.samples_per_pixel)} samples a pixel`}`,
     psnr: interval,
-    traced: `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
+    traced: drawnWords(record) ?? `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
     trusted: `${percent(record.trusted_volume)} of the domain`,
     seconds: `${number(record.seconds?.total)} s`,
     slide: count(record.slide),

@@ -99,6 +99,9 @@ test("a map says its values, seeds and error, and is saved as a field", async ()
   const page = await open(map.url);
   await until("the sentence", async () => /, [\d,]+ seeds a pixel\.$/.test(await page.textContent("#state")));
   assert.ok(await page.isHidden("#scale-light"), "colours of a map have no shadow");
+  // Without a surrogate there is no tolerance, and all is traced.
+  const titles = await page.locator(".chart:not([hidden]) figcaption").allTextContents();
+  assert.deepEqual(titles, ["Error of the picture (PSNR, higher is better) in dB", "Frame time by stage in s"]);
   const box = await page.locator("#frame").boundingBox();
   await page.mouse.move(box.x + box.width / 3, box.y + box.height / 2);
   await until("a value", async () => /^frame [\d,]+ at \d+, \d+: FTLE [\d.]+ ± [\d.e−]+$/.test(await page.textContent("#values")));

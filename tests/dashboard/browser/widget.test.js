@@ -48,6 +48,15 @@ test("the picture is drawn and acknowledged, and its record told", async () => {
   assert.equal(await page.textContent("#cell div"), "frame 12, slide 3, t = 4.5 s; error 0.912 % rms, 40.8 dB; 25.0 % traced; cpu");
   await page.evaluate(() => window.model.set({ record: { frame: 13, slide: 3, time: 5, date: "2002-01-03", picture_error: null } }));
   assert.equal(await page.textContent("#cell div"), "frame 13, slide 3, 2002-01-03; no error stated; – traced; –");
+  for (const [changes, told] of [
+    [{ method: "two_level", surrogate: "table", traced: 2552 }, "drawn by a table and corrected with 2552 traced points"],
+    [{ method: "marched", surrogate: "residual", traced: 2552 }, "drawn by a table with a network, uncorrected: 2552 traced points only measure its error"],
+    [{ method: "map", picture_error: { ...record.picture_error, samples_per_pixel: 24 } }, "24 seeds a pixel"],
+    [{ method: "gated", surrogate: "network", traced: 2552 }, "25.0 % traced"],
+  ]) {
+    await page.evaluate((set) => window.model.set({ record: set }), { ...record, ...changes });
+    assert.equal(await page.textContent("#cell div"), `frame 12, slide 3, t = 4.5 s; error 0.912 % rms, 40.8 dB; ${told}; cpu`);
+  }
   await page.evaluate(() => window.model.set({ state: "nothing new for 6 s" }));
   assert.match(await page.textContent("#cell"), /nothing new for 6 s/);
   await page.close();

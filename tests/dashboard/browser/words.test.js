@@ -1,8 +1,9 @@
 // The words of the page: unknown values are said as unknown.
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { partsOf } from "../../../src/dashboard/page/terms.js";
 import { Warnings } from "../../../src/dashboard/page/warnings.js";
-import { duration, facts, lag, number, percent, sentence, shareOfPeak, windowWords } from "../../../src/dashboard/page/words.js";
+import { duration, facts, lag, number, percent, sentence, shareOfPeak, surrogateError, tracedShare, windowWords } from "../../../src/dashboard/page/words.js";
 
 const record = {
   frame: 8120, slide: 812, time: 3.2, time_unit: "s", date: null, tau: 2, direction: "backward", live: { age: 0.3, step: 40600 }, seconds: { total: 0.1 },
@@ -39,6 +40,42 @@ test("a surrogate that saves nothing is told so", () => {
   assert.match(sentence({ ...following, record: { ...gated, method: "reference", traced_share: 1 } }), /, 100 % traced\.$/);
 });
 
+test("where a surrogate draws the picture, it is told what the traced points are for", () => {
+  const two = { ...record, method: "two_level", surrogate: "table", traced_share: 1, traced: 2552 };
+  const corrected = "drawn by a table and corrected with 2,552 traced points";
+  assert.ok(sentence({ ...following, record: two }).endsWith(`error 0.89 % (41 dB), ${corrected}.`));
+  assert.equal(facts(two).traced, corrected);
+  const marched = { ...two, method: "marched", surrogate: "residual" };
+  assert.match(sentence({ ...following, record: marched }), /, drawn by a table with a network, uncorrected: 2,552 traced points only measure its error\.$/);
+  assert.match(sentence({ ...following, record: { ...two, surrogate: null, traced: null } }), /, drawn by a surrogate and corrected with traced points\.$/);
+  for (const method of ["map", "reference", "surrogate", "marched", "two_level"]) assert.equal(tracedShare({ method, traced_share: 1 }), null);
+  assert.deepEqual([tracedShare({ method: "gated", traced_share: 0.25 }), tracedShare({ method: "gated", traced_share: null })], [0.25, null]);
+});
+
+test("the error of the surrogate is that of what it answered", () => {
+  const trusted = { over_budget: 0, tolerance: 0.03, tolerance_excess: null, trusted_error: { optical_rms: 0.02 } };
+  assert.equal(surrogateError(trusted), 0.02);
+  assert.equal(surrogateError({ ...trusted, trusted_error: null }), null, "all is traced");
+  // Also where it is not trusted, since the tracing budget was spent.
+  const spent = { ...trusted, over_budget: 12, tolerance_excess: 0.01, trusted_error: null };
+  assert.equal(surrogateError(spent), 0.04);
+  assert.equal(surrogateError({ ...spent, tolerance_excess: 0 }), 0.03, "within the tolerance");
+  assert.equal(surrogateError({ ...spent, trusted_error: { optical_rms: 0.05 } }), 0.05, "the larger one");
+  assert.equal(surrogateError({ ...spent, tolerance_excess: null }), null);
+  const told = sentence({ ...following, record: { ...record, ...spent, picture_error: null, method: "gated" } });
+  assert.match(told, /, error where the surrogate answered 4 %, of the picture unknown, 12 % traced\.$/);
+});
+
+test("terms of messages are found where they are used first, and not in settings, names and paths", () => {
+  const found = (text) => partsOf(text).filter((part) => part.term).map(({ term, text: words }) => `${term}: ${words}`);
+  assert.deepEqual(found("Slide 3: the log-stretch (FTLE times tau) of slide 3 differs"), ["slide: Slide", "stretch: log-stretch", "ftle: FTLE", "tau: tau"]);
+  assert.deepEqual(found("the tracing budget was spent in untrusted cells"), ["trace_budget: tracing budget", "trusted: untrusted"]);
+  assert.deepEqual(found("`trust.tolerance`, time.tau = 2, run-slide-3.nc and /data/slide/tau.nc"), []);
+  const text = "error of the colours (optical residual) <b>above</b> the tolerance";
+  assert.equal(partsOf(text).map((part) => part.text ?? part).join(""), text);
+  assert.deepEqual(partsOf("plain"), ["plain"]);
+});
+
 test("a lost connection, a silent publisher and looking back are said first", () => {
   assert.match(sentence({ ...following, link: "lost" }), /^Not connected; last seen: frame 8,120/);
   assert.match(sentence({ ...following, status: "silent", silence: 12.3 }), /^Silent for 12 s; last: frame 8,120/);
@@ -73,6 +110,22 @@ test("a slide that is too coarse in time is told in all its frames", () => {
   assert.equal(told.text, `Too ${text}`);
   warnings.read([{ ...record, live: null, slide: record.slide + 1, warnings: [] }]);
   assert.ok(!conditions(warnings).includes("time"));
+});
+
+test("a gate that trusts nothing is told until it does, and logged once", () => {
+  const warnings = new Warnings();
+  const gated = { ...record, live: null, method: "gated", trusted_error: null, traced_share: 1 };
+  for (const frame of [1, 2, 3]) warnings.read([{ ...gated, frame }]);
+  const told = () => warnings.conditions({ link: "open", status: "following" }).find(({ id }) => id === "untrusted")?.text;
+  assert.match(told(), /^The surrogate is trusted nowhere yet: .* within the tolerance, so that all is traced$/);
+  assert.deepEqual(warnings.log.newestFirst().map(({ times, frame }) => [times, frame]), [[1, 1]]);
+  warnings.read([{ ...gated, traced_share: 0.5 }]);
+  assert.match(told(), /within the tolerance$/);
+  warnings.read([{ ...gated, trusted_error: { optical_rms: 0.02 } }]);
+  assert.equal(told(), undefined);
+  // Other methods do not depend on it.
+  warnings.read([{ ...gated, method: "two_level" }]);
+  assert.equal(told(), undefined);
 });
 
 test("counts that do not rise are no news", () => {
