@@ -36,12 +36,12 @@ const MIN_BATCH: usize = 1 << 12;
 const MAX_BATCH: [usize; 2] = [1 << 20, 1 << 23];
 /// Seconds for which networks are trained before each measurement, the tracing of their labels included.
 const TRAINED: [f64; 3] = [1.0, 3.0, 10.0];
-/// Seconds of training between fresh labels, and how often a label is trained on.
-const SLICE: f64 = 0.25;
+/// Seconds of training between fresh labels, at first and at most, and how often a label is trained on.
+const SLICES: [f64; 2] = [0.02, 0.25];
 const REUSE: u64 = 4;
 /// Labels before the first training, and most fresh ones afterwards.
 const FIRST_LABELS: usize = 1 << 16;
-const MAX_FRESH: usize = 1 << 21;
+const MAX_FRESH: usize = 1 << 24;
 /// A small network has 2^-5 of the entries.
 const SMALLER: u32 = 5;
 /// What is said of methods that ran on the CPU in a chart of a GPU.
@@ -620,6 +620,8 @@ struct Lessons<'a> {
     /// Points traced so far, and in the next turn.
     drawn: u64,
     fresh: usize,
+    /// Seconds of the next training.
+    slice: f64,
     /// Optimizer steps so far.
     steps: u64,
     /// Seconds of tracing and training so far.
@@ -629,10 +631,10 @@ struct Lessons<'a> {
 impl<'a> Lessons<'a> {
     fn new(opened: &'a Opened) -> Self {
         let buffer = ReplayBuffer::new(opened.plan.scene.training.replay_buffer);
-        Self { opened, buffer, drawn: 0, fresh: FIRST_LABELS, steps: 0, seconds: 0.0 }
+        Self { opened, buffer, drawn: 0, fresh: FIRST_LABELS, slice: SLICES[0], steps: 0, seconds: 0.0 }
     }
 
-    /// Traces fresh labels and trains for [`SLICE`] seconds, until about `end` seconds in all.
+    /// Traces fresh labels and trains on all for a slice of time, which doubles up to the longest. Ends at about `end` seconds in all.
     fn give<S: Surrogate<Tracer = T>, T: Trace>(&mut self, surrogate: &mut S, tracer: &T, end: f64) -> Result<(), RunError> {
         const STREAM: u32 = 4;
         let began = Instant::now();
@@ -644,11 +646,12 @@ impl<'a> Lessons<'a> {
         }
         self.drawn += self.fresh as u64;
         let traced = began.elapsed().as_secs_f64();
-        let left = (end - self.seconds - traced).clamp(0.01, SLICE);
+        let left = (end - self.seconds - traced).clamp(0.01, self.slice);
         let learned = surrogate.learn(&self.buffer, left, u64::MAX).map_err(failed)?;
         // Tracing takes no longer than training.
         let as_long = self.fresh as f64 * learned.seconds / traced;
         self.fresh = ((learned.samples / REUSE) as usize).min(as_long as usize).clamp(MIN_BATCH, MAX_FRESH);
+        self.slice = SLICES[1].min(2.0 * self.slice);
         self.steps += learned.steps;
         self.seconds += began.elapsed().as_secs_f64();
         Ok(())
