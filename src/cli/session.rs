@@ -476,6 +476,8 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "optimizer_steps": report.train_steps,
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,
+        "precision_difference": report.precision_difference,
+        "tangent_difference": report.tangent_difference,
         "integration_residual": report.integration_residual,
         "transfer": report.transfer,
         "surrogate_bytes": report.surrogate_bytes,

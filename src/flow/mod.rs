@@ -17,6 +17,7 @@ mod displacement;
 mod dormand_prince;
 mod error;
 mod grid_flow;
+mod integration;
 mod missing_cells;
 mod resolution;
 mod rk4;
@@ -34,6 +35,7 @@ pub use assemble::{cpu_tracer, dormand_prince_tracer, scalar_tracer, tracer_in_o
 pub use axis_map::AxisMap;
 pub use composition::Composition;
 pub use error::FlowError;
+pub use integration::{IntegrationDifferences, integration_differences};
 pub use missing_cells::MissingCells;
 pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};

@@ -35,12 +35,13 @@ pub fn quasi_random_points(domain: &Domain, count: usize) -> Vec<DomainPoint> {
 /// Root mean square difference of two traces over the paths that span the whole time in both, or over all paths if those are rare. A path
 /// that stops is cut to whole steps, which is an error of another order that would hide that of the integrator.
 pub fn rms_difference(a: &Traced, b: &Traced) -> f64 {
-    trimmed_difference(a, b, 0.0).0
+    trimmed_difference(a, b, false).0
 }
 
-/// [`rms_difference`] without the share `trimmed` of the points that differ most, and the number of points without a finite difference. The
-/// difference is infinite if the latter are more than [`TRIMMED_SHARE`] of all.
-fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> (f64, usize) {
+/// [`rms_difference`], on grids without the [`TRIMMED_SHARE`] of the points that differ most, and the number of points without a finite
+/// difference. The difference is infinite if the latter are more than that share of all.
+pub fn trimmed_difference(a: &Traced, b: &Traced, gridded: bool) -> (f64, usize) {
+    let trimmed = if gridded { TRIMMED_SHARE } else { 0.0 };
     let whole = |i: &usize| a.lifetime_share[*i] >= 1.0 && b.lifetime_share[*i] >= 1.0;
     let all = 0..a.lifetime_share.len();
     let complete = all.clone().filter(whole).count();
@@ -63,6 +64,11 @@ fn rms_of_whole(traced: &Traced) -> f64 {
     let whole = traced.log_stretch.iter().zip(&traced.lifetime_share).filter(|(s, share)| **share >= 1.0 && s.is_finite());
     let (sum, count) = whole.fold((0.0, 0usize), |(sum, count), (s, _)| (sum + f64::from(*s).powi(2), count + 1));
     if count < MIN_COMPLETE_PATHS { f64::INFINITY } else { (sum / count as f64).sqrt() }
+}
+
+/// The largest difference with which a choice of steps ends, on paths whose log-stretch was `traced`.
+pub fn allowed(tolerance: f64, share: f64, traced: &Traced) -> f64 {
+    tolerance.min((share * rms_of_whole(traced)).max(MIN_BOUND * tolerance))
 }
 
 /// Bounds on the number of steps.
@@ -95,7 +101,6 @@ pub fn choose_steps(
     let points = quasi_random_points(domain, StepChoice::POINTS);
     let (mut once, mut twice) = (Traced::default(), Traced::default());
     let gridded = intervals > 0;
-    let trimmed = if gridded { TRIMMED_SHARE } else { 0.0 };
     let first = (min_steps.ceil() as usize)
         .clamp(MIN_STEPS_PER_INTERVAL * intervals, MAX_STEPS_PER_INTERVAL_FOR_CELLS * intervals)
         .next_multiple_of(intervals.max(1));
@@ -110,8 +115,8 @@ pub fn choose_steps(
     while steps <= max_steps {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
-        let (difference, not_finite) = trimmed_difference(&once, &twice, trimmed);
-        let within_tolerance = difference <= tolerance.min((share * rms_of_whole(&twice)).max(MIN_BOUND * tolerance));
+        let (difference, not_finite) = trimmed_difference(&once, &twice, gridded);
+        let within_tolerance = difference <= allowed(tolerance, share, &twice);
         last = StepChoice { steps, difference, within_tolerance, not_finite, multiple_of };
         if last.within_tolerance {
             return Ok(last);
@@ -151,9 +156,9 @@ mod tests {
             lifetime_share: vec![1.0; 1000],
             ..Traced::default()
         };
-        for trimmed in [0.0, TRIMMED_SHARE] {
-            assert_eq!(trimmed_difference(&traced(0), &traced(20), trimmed), (0.0, 20));
-            assert_eq!(trimmed_difference(&traced(0), &traced(21), trimmed), (f64::INFINITY, 21), "no choice rests on what is left");
+        for gridded in [false, true] {
+            assert_eq!(trimmed_difference(&traced(0), &traced(20), gridded), (0.0, 20));
+            assert_eq!(trimmed_difference(&traced(0), &traced(21), gridded), (f64::INFINITY, 21), "no choice rests on what is left");
         }
     }
 

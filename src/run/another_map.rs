@@ -71,7 +71,8 @@ impl<B: Backend> Cycle<'_, B> {
             self.take_steps(chosen, None);
         }
         self.draw_anew(slide)?;
-        let warnings = self.run.flow_warnings(with!(&self.session, on => on.tracer().flow()), chosen);
+        let differences = self.measure_integration(slide, chosen)?;
+        let warnings = self.run.flow_warnings(with!(&self.session, on => on.tracer().flow()), chosen, differences);
         slide.warnings.extend(warnings);
         self.settle_steps(slide, chosen)?;
         self.learn_anew(slide)

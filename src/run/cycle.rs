@@ -7,6 +7,7 @@
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
 use super::decision::{Decision, enter_colours, suited_network, why_steps};
+use super::integration::integration_warnings;
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
 use super::refine::Frames;
@@ -23,7 +24,9 @@ use super::{ColorBar, RunError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
-use crate::flow::{FlowError, FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution};
+use crate::flow::{
+    FlowError, FlowMap, IntegrationDifferences, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution,
+};
 use crate::progress;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::source::SourceKind;
@@ -109,8 +112,13 @@ pub struct RunReport {
     pub train_steps: u64,
     /// Runge-Kutta steps per path in the last slide; `None` if each path chooses its own steps, or if there was no tracer yet.
     pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from that of at least twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
+    /// Difference of the log-stretch from that of at least twice as many steps; `None` if it is not finite, or if each path chooses its own
+    /// steps (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
+    /// Difference of the log-stretch in single from that in double precision; `None` in double precision (see [`IntegrationDifferences`]).
+    pub precision_difference: Option<f64>,
+    /// Difference of the log-stretch by central differences from that by the tangent; `None` for other integrators.
+    pub tangent_difference: Option<f64>,
     /// Optical residual of the steps; `None` unless they were chosen by it.
     pub integration_residual: Option<f64>,
     /// Transfer function; `None` if the run ended before it was chosen.
@@ -394,7 +402,8 @@ fn drive<B: Backend>(
     if let Some(chosen) = chosen {
         cycle.take_steps(chosen, None);
     }
-    slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen));
+    let differences = cycle.measure_integration(&slide, chosen)?;
+    slide.warnings.extend(cycle.run.flow_warnings(with!(&cycle.session, on => on.tracer().flow()), chosen, differences));
     cycle.settle_steps(&slide, chosen)?;
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
     cycle.run.end_commands();
@@ -936,9 +945,17 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Warnings about a flow map whose steps were chosen.
-    pub(super) fn flow_warnings(&self, flow: &dyn Tracer, chosen: Option<StepChoice>) -> Vec<String> {
+    /// Warnings about a flow map whose steps were `chosen` or given.
+    pub(super) fn flow_warnings(
+        &self,
+        flow: &dyn Tracer,
+        chosen: Option<StepChoice>,
+        differences: Option<IntegrationDifferences>,
+    ) -> Vec<String> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
+        if let Some(found) = &differences {
+            warnings.extend(integration_warnings(found, &self.plan.map, flow.steps(), chosen.is_some()));
+        }
         if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(
                 "{} of {} paths of the step choice have no finite log-stretch (FTLE times tau): the integration overflowed there",

@@ -398,6 +398,8 @@ impl Run<'_> {
             traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,
             integration_steps: fixed_steps(flow).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
+            precision_difference: self.report.precision_difference,
+            tangent_difference: self.report.tangent_difference,
             integration_residual: self.report.integration_residual,
             preparation_traces: std::mem::take(&mut self.progress.preparation_traces) + tally.nodes,
             audited: work.audit.points as u64,

@@ -13,6 +13,7 @@ mod decision;
 mod default_tau;
 mod error;
 mod frame;
+mod integration;
 mod memory;
 mod prepare;
 mod race;

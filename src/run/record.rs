@@ -93,8 +93,14 @@ pub struct FrameRecord {
     pub picture_error: Option<PictureError>,
     /// Runge-Kutta steps a path. `None` for Dormand-Prince.
     pub integration_steps: Option<u64>,
-    /// Difference of the log-stretch from at least twice as many steps: the error of the traced field itself. `None` if the steps were given.
+    /// Difference of the log-stretch from at least twice as many steps: the error of the traced field itself. `None` for Dormand-Prince.
     pub integration_difference: Option<f64>,
+    /// Difference of the log-stretch in single precision from that in double precision with the same steps. `None` in double precision.
+    #[serde(default)]
+    pub precision_difference: Option<f64>,
+    /// Difference of the log-stretch by central differences from that by the tangent. `None` for other integrators.
+    #[serde(default)]
+    pub tangent_difference: Option<f64>,
     /// Optical residual of the steps against twice as many as the log-stretch asks for. `None` unless the steps were chosen by it.
     #[serde(default)]
     pub integration_residual: Option<f64>,
