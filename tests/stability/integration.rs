@@ -2,20 +2,48 @@
 
 use crate::kit::flow::{EVERYTHING, trace};
 use crate::kit::scene;
-use crate::sweep::{TOLERANCE, adaptive, bisect, double_gyre, gyre_box, in_square, lattice, map, rms_difference, row, traced};
-use ridgewatch::field::{DomainPoint, analytic::Analytic};
-use ridgewatch::flow::{Extras, FlowError, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
-use ridgewatch::run::RunOptions;
+use crate::sweep::{TOLERANCE, adaptive, bisect, double_gyre, gyre_box, in_square, lattice, map, rms_difference, row, traced, window};
+use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, analytic::Analytic};
+use ridgewatch::flow::{
+    Boundary, Extras, FlowError, FlowMap, IntegrationDifferences, Integrator, Interpolation, Precision, Steps, VelocitySource, cpu_tracer,
+    integration_differences,
+};
+use ridgewatch::run::{FrameRecord, RunOptions};
+use std::sync::Arc;
 
 const TAU: f64 = 10.0;
+const SQUARE: &str = "domain.min = [-1, -1, 0]\ndomain.max = [1, 1, 0.2]\ntransfer.low = 0\ntransfer.high = 2\n";
+
+/// What a run measures of a flow map with a given number of steps.
+fn measured(source: &VelocitySource, map: &FlowMap) -> IntegrationDifferences {
+    integration_differences(source, map, 0.0, None, Steps::Auto { tolerance: TOLERANCE }).unwrap().unwrap()
+}
+
+/// The record of the first frame of a scene.
+fn record(kind: &str, keys: &str) -> FrameRecord {
+    let (mut records, keys) = (Vec::new(), format!("{keys}\nrender.method = \"reference\""));
+    let setup = scene::setup(&scene::scene(kind, [8, 4, 1], &keys), &[]);
+    scene::run_frames(setup, &RunOptions::default(), |frame| records.push((*frame.record).clone()));
+    records.swap_remove(0)
+}
+
+fn warns(record: &FrameRecord, of: &str) -> bool {
+    record.warnings.iter().any(|warning| warning.starts_with(of))
+}
 
 #[test]
 fn difference_gap() {
     let (source, seeds) = (double_gyre(), lattice(&gyre_box(), [60, 30]));
     let exact = traced(&source, &adaptive(TAU), 0.0, &seeds);
+    let of_a_run = |keys: &str| record("double_gyre", &format!("{}time.tau = {TAU}\nflow.steps = 200\n{keys}", scene::GYRE_BOX));
+    let wide = of_a_run("flow.integrator = \"differences\"\nflow.difference_step = 0.01");
+    assert!(wide.tangent_difference.unwrap() > TOLERANCE && warns(&wide, "flow.integrator = \"differences\""), "{:?}", wide.warnings);
+    let tangent = of_a_run("");
+    assert!(tangent.tangent_difference.is_none() && !warns(&tangent, "flow."), "{:?}", tangent.warnings);
     for precision in [Precision::F32, Precision::F64] {
         let tangent = rms_difference(&traced(&source, &map(TAU, 200, precision), 0.0, &seeds), &exact);
-        let mut curve: Vec<(f64, f64)> = Vec::new();
+        // Gap, error, and the number in the record.
+        let mut curve: Vec<(f64, f64, f64)> = Vec::new();
         let mut refused = None;
         for half_decades in 2..=16 {
             let gap = 10f64.powf(-0.5 * f64::from(half_decades));
@@ -23,12 +51,18 @@ fn difference_gap() {
             match cpu_tracer(source.clone(), &map, 0.0) {
                 Err(FlowError::DifferenceStepVanishes { min_step, .. }) => refused = refused.or(Some((gap, min_step))),
                 Err(error) => panic!("{error}"),
-                Ok(_) => curve.push((gap, rms_difference(&traced(&source, &map, 0.0, &seeds), &exact))),
+                Ok(_) => {
+                    let error = rms_difference(&traced(&source, &map, 0.0, &seeds), &exact);
+                    curve.push((gap, error, measured(&source, &map).tangent.unwrap()));
+                }
             }
         }
-        curve.iter().for_each(|(gap, error)| println!("{precision:?}, gap {gap:.1e}: {error:.1e}; tangent {tangent:.1e}"));
-        let (best, least) = curve.iter().copied().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
-        let within: Vec<f64> = curve.iter().filter(|(_, error)| *error <= TOLERANCE).map(|(gap, _)| *gap).collect();
+        for (gap, error, recorded) in &curve {
+            println!("{precision:?}, gap {gap:.1e}: {error:.1e}, recorded {recorded:.1e}; tangent {tangent:.1e}");
+        }
+        assert!(curve.iter().all(|c| c.1 < 1.5 * TOLERANCE || c.2 > TOLERANCE), "every gap that fails is warned of: {curve:?}");
+        let (best, least, _) = curve.iter().copied().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+        let within: Vec<f64> = curve.iter().filter(|c| c.1 <= TOLERANCE).map(|c| c.0).collect();
         let (first, last) = (curve[0].1, curve[curve.len() - 1].1);
         // A U: truncation (gap squared) on one side, rounding (its inverse) on the other.
         assert!(first > 10.0 * least, "a wide gap fails");
@@ -48,12 +82,16 @@ fn difference_gap() {
             (_, Some(high)) => format!("gap above {high:.0e}; none of those down to {smallest:.0e}"),
             _ => "at every gap".to_owned(),
         };
+        let wide = curve.iter().take_while(|c| c.1 > TOLERANCE).last().expect("a wide gap fails");
+        let number =
+            format!("`tangent_difference`: {:.0e} at a gap of {:.0e}, {:.0e} at the smallest", wide.2, wide.0, curve[curve.len() - 1].2);
+        let always = format!("warns above {TOLERANCE}; the default is the tangent, which has no gap");
         let does = match refused {
-            Some((_, least)) => format!("refuses gaps below {least:.1e}, where pairs coincide; the default is the tangent, which has none"),
-            None => "the default is the tangent, which has no gap".to_owned(),
+            Some((_, least)) => format!("refuses gaps below {least:.1e}, where pairs coincide; {always}"),
+            None => always,
         };
         let error = format!("at best {least:.1e} (gap {best:.0e}), {last:.1e} at the smallest; tangent {tangent:.1e}");
-        row([&name, &range, "none; `flow.integrator` is in the summary", &does, &error, "difference_gap"]);
+        row([&name, &range, &number, &does, &error, "difference_gap"]);
     }
 }
 
@@ -74,11 +112,11 @@ fn steps_beyond_the_stability_limit() {
     };
     let limits = [
         // |R(iz)|^2 = 1 - z^6 / 72 + z^8 / 576.
-        ("RK4 steps, fast rotation", Analytic::Rotation { omega: 1.0 }, 8f64.sqrt(), 0.0),
+        ("RK4 steps, fast rotation", "rotation", Analytic::Rotation { omega: 1.0 }, 8f64.sqrt(), 0.0),
         // The real root of 1 - z / 2 + z^2 / 6 - z^3 / 24.
-        ("RK4 steps, stiff contraction", Analytic::Saddle { rate: 1.0 }, 2.785_293_563, 1.0),
+        ("RK4 steps, stiff contraction", "saddle", Analytic::Saddle { rate: 1.0 }, 2.785_293_563, 1.0),
     ];
-    for (name, flow, limit, rate) in limits {
+    for (name, kind, flow, limit, rate) in limits {
         let found = bisect(1.0, 4.0, |z| grows(&flow, z));
         assert!((found / limit - 1.0).abs() < 2e-4, "{name}: {found} {limit}");
         // The error of the FTLE where it just fails, in shares of the rate.
@@ -89,11 +127,17 @@ fn steps_beyond_the_stability_limit() {
         // The difference to twice as many steps is 15/16 of the error (rotation 31/32: its leading term is damping).
         let error = (stretch - rate * 100.0).abs();
         assert!(error < 1.2 * TOLERANCE, "{error}");
+        // The same numbers of steps, given to a run.
+        let given = |tau: f64, steps: usize| record(kind, &format!("{SQUARE}time.tau = {tau}\nflow.steps = {steps}"));
+        let (failed, fine) = (given(tau, COUNT), given(100.0, choice.steps));
+        let [told, told_fine] = [&failed, &fine].map(|record| record.integration_difference.unwrap());
+        assert!(told > TOLERANCE && warns(&failed, &format!("flow.steps = {COUNT}: ")), "{told} {:?}", failed.warnings);
+        assert!(told_fine <= TOLERANCE && !warns(&fine, "flow.steps"), "{told_fine} {:?}", fine.warnings);
         row([
             name,
             &format!("rate x step above {found:.3}"),
-            "`integration_difference`, null if `flow.steps` is a number",
-            &format!("`steps = \"auto\"` takes rate x step {z:.2}; a given number is obeyed without a word"),
+            &format!("`integration_difference`: {told:.0} at 1.2 times the limit"),
+            &format!("`steps = \"auto\"` takes rate x step {z:.2}; a given number is obeyed, with a warning above {TOLERANCE}"),
             &format!("auto {error:.1e} of the log-stretch; at 1.2 times the limit FTLE {wrong:.2} of the rate instead of {rate:.0}"),
             "steps_beyond_the_stability_limit",
         ]);
@@ -108,12 +152,68 @@ fn steps_beyond_the_stability_limit() {
     let worst = [0.1, 1.0, 10.0, 100.0, 1000.0].map(sheared).into_iter().fold(0.0, f64::max);
     assert!(worst < 1e-12, "{worst:e}");
     row([
-        "RK4 steps, stiff shear",
+        "RK4 steps, uniform shear",
         "nowhere up to rate x step 1,000",
         "none is needed",
         "RK4 is exact: the gradient of a uniform shear is nilpotent",
         &format!("at most {worst:.0e} of the log-stretch"),
         "steps_beyond_the_stability_limit",
+    ]);
+}
+
+/// `flow.tolerance` of archives in two dimensions.
+const TOLERANCE_ON_GRIDS: f64 = 0.1;
+
+/// Waves of shear of this rate, whose direction turns once a unit of time: v = (cos(2 pi t) sin(2 pi y), sin(2 pi t) sin(2 pi x)) rate / 2 pi.
+fn turning_shear(rate: f64, tau: f64) -> VelocitySource {
+    use std::f64::consts::TAU;
+    const NODES: usize = 128;
+    let axis = |name: &str| Axis::uniform(name, "", 0.0, 1.0 - 1.0 / NODES as f64, NODES).unwrap().with_period(1.0);
+    let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+    let wave = |node: usize| rate / TAU * (TAU * node as f64 / NODES as f64).sin();
+    VelocitySource::Window(window(tau, 1.0 / 16.0, |time| {
+        let (sin, cos) = (TAU * time).sin_cos();
+        let u: Vec<f32> = (0..grid.nodes()).map(|i| (cos * wave(i / NODES)) as f32).collect();
+        let v: Vec<f32> = (0..grid.nodes()).map(|i| (sin * wave(i % NODES)) as f32).collect();
+        Snapshot::from_components(time, grid.clone(), &u, &v, &[])
+    }))
+}
+
+#[test]
+fn steps_too_long_for_a_shear_that_turns() {
+    const RATE: f64 = std::f64::consts::TAU;
+    const TURNS: usize = 2;
+    let source = turning_shear(RATE, TURNS as f64);
+    let with =
+        |steps| FlowMap { steps, boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, ..map(TURNS as f64, 1, Precision::F64) };
+    let seeds = lattice(&Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), [40, 40]);
+    let exact = traced(&source, &with(Steps::Fixed(2048 * TURNS)), 0.0, &seeds);
+    let adaptive = traced(&source, &FlowMap { integrator: Integrator::DormandPrince, ..with(Steps::Fixed(1)) }, 0.0, &seeds);
+    assert!(rms_difference(&exact, &adaptive) < 0.1 * TOLERANCE, "two integrators agree");
+    let error = |map: &FlowMap| rms_difference(&traced(&source, map, 0.0, &seeds), &exact);
+    let found: Vec<(usize, f64, f64)> = [1, 2, 4, 8, 16, 32, 64]
+        .map(|a_turn| {
+            let map = with(Steps::Fixed(a_turn * TURNS));
+            (a_turn, error(&map), measured(&source, &map).steps)
+        })
+        .to_vec();
+    found.iter().for_each(|(a_turn, error, recorded)| println!("{a_turn} steps a turn: {error:.1e}, recorded {recorded:.1e}"));
+    assert!(found.iter().all(|f| f.1 <= TOLERANCE_ON_GRIDS || f.2 > TOLERANCE_ON_GRIDS), "what fails is warned of: {found:?}");
+    let fails = found.iter().rposition(|f| f.1 > TOLERANCE).expect("few steps fail");
+    let (last, first) = (found[fails], *found.get(fails + 1).expect("many do not"));
+    let auto = with(Steps::Auto { tolerance: TOLERANCE_ON_GRIDS });
+    let (taken, by_auto) = (cpu_tracer(source.clone(), &auto, 0.0).unwrap().steps() / TURNS, error(&auto));
+    assert!(taken >= first.0 && by_auto < TOLERANCE, "{taken} steps a turn: {by_auto:e}");
+    row([
+        "RK4 steps, shear that turns",
+        &format!("{} steps a turn (rate x step {:.2}); {} hold", last.0, RATE / last.0 as f64, first.0),
+        &format!("`integration_difference`: {:.2} there, {:.0e} with {}", last.2, first.2, first.0),
+        &format!(
+            "`steps = \"auto\"` takes {taken} a turn: two a snapshot interval or more; a given number is obeyed, with a warning above \
+             {TOLERANCE_ON_GRIDS}"
+        ),
+        &format!("{:.2} of the log-stretch there, {:.0e} with {}; auto {by_auto:.0e}", last.1, first.1, first.0),
+        "steps_too_long_for_a_shear_that_turns",
     ]);
 }
 
@@ -194,12 +294,14 @@ fn chaos_parts_single_from_double_precision() {
         let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
         let drift = mean(&a) / mean(&b) - 1.0;
         let picture = correlation(&blocks(&a, 40, 4), &blocks(&b, 40, 4));
-        found.push((tau, parted, correlation(&a, &b), drift, distribution_distance(&a, &b), picture));
+        let recorded = measured(&source, &map(tau, (20.0 * tau) as usize, Precision::F32)).precision.unwrap();
+        found.push((tau, parted, correlation(&a, &b), drift, distribution_distance(&a, &b), picture, recorded));
     }
-    for (tau, parted, correlation, drift, distance, picture) in &found {
+    for (tau, parted, correlation, drift, distance, picture, recorded) in &found {
         let parted = 100.0 * parted;
         println!(
-            "tau {tau}: {parted:.1} % parted, correlation {correlation:.4}, of 4x4 {picture:.4}, mean {drift:+.1e}, distribution {distance:.3}"
+            "tau {tau}: {parted:.1} % parted, correlation {correlation:.4}, of 4x4 {picture:.4}, mean {drift:+.1e}, distribution {distance:.3}, \
+             recorded {recorded:.1e}"
         );
     }
     let parts = found.iter().find(|f| f.1 > 0.1).expect("paths part");
@@ -210,6 +312,13 @@ fn chaos_parts_single_from_double_precision() {
     assert!(last.1 > 0.5 && last.2 < 0.95, "points lose their value: {last:?}");
     // Two samples of 800 differ by 0.068 (Kolmogorov, 5 %) if they have the same distribution.
     assert!(found.iter().all(|f| f.3.abs() < 0.01 && f.4 < 0.068), "mean and distribution do not: {found:?}");
+    assert!(found[0].6 < TOLERANCE && found.iter().all(|f| f.1 < 0.01 || f.6 > TOLERANCE), "paths that part are warned of: {found:?}");
+    let told = found.iter().find(|f| f.6 > TOLERANCE).expect("a warning");
+    let warned = |tau: f64| {
+        let keys = format!("{}time.tau = {tau}\nflow.steps = {}", scene::GYRE_BOX, 20.0 * tau);
+        warns(&record("double_gyre", &keys), "flow.precision = \"f32\"")
+    };
+    assert!(!warned(found[0].0) && warned(parts.0), "a run says so");
     let refused = [40.0, 80.0, 160.0, 320.0].into_iter().find(|&tau| {
         let map = FlowMap { steps: Steps::Auto { tolerance: TOLERANCE }, ..map(tau, 1, Precision::F32) };
         matches!(cpu_tracer(source.clone(), &map, 0.0), Err(FlowError::StepsNotFound { .. }))
@@ -218,9 +327,11 @@ fn chaos_parts_single_from_double_precision() {
     row([
         "long tau, chaos, f32 against f64",
         &format!("tau {} ({:.0} % of the paths part by 0.1; at {}: {:.0} %)", parts.0, 100.0 * parts.1, before.0, 100.0 * before.1),
-        "none: `integration_difference` compares steps in f64",
+        &format!("`precision_difference`: {:.1} there, {:.0e} at tau {}", parts.6, found[0].6, found[0].0),
         &format!(
-            "`steps = \"auto\"` is refused at tau {}: no number of steps agrees with twice as many",
+            "warns above {TOLERANCE}, here from tau {} on; `steps = \"auto\"` is refused at tau {}: no number of steps agrees with twice as \
+             many",
+            told.0,
             refused.map_or("-".into(), |t| t.to_string())
         ),
         &format!(
