@@ -7,9 +7,12 @@ use ridgewatch::backend::cuda::{CudaTracer, DeviceError, GpuSettings, SnapshotSt
 use ridgewatch::backend::{CudaDevice, Device, WhenLost};
 use ridgewatch::field::{DomainPoint, Window};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Steps, Traced, VelocitySource};
-use ridgewatch::run::{RunOptions, RunReport};
+use ridgewatch::run::{Event, RunOptions, RunReport, Steering, run};
 use ridgewatch::surrogate::Trace;
+use serde_json::json;
+use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 #[test]
 #[ignore = "needs a GPU"]
@@ -327,4 +330,45 @@ fn smooth_pictures_do_not_show_half_precision() {
         println!("slide {}: films differ by {rms:.2e} rms, stated error {stated:.2e}", before.record.slide);
         assert!(rms > 0.0 && rms < 0.7 * stated, "as many samples, of the same random numbers: {rms} of {stated}");
     }
+}
+
+/// Slides, cameras and finer tables come and go, and a subscriber keeps the newest films.
+#[test]
+#[ignore = "needs a GPU"]
+fn memory_is_flat_over_a_thousand_frames_of_smooth_pictures() {
+    const SLIDES: u64 = 20;
+    const FRAMES: u64 = 50;
+    let keys = format!(
+        "source.nodes = [48, 24, 24]\nsource.snapshots = {}\ntime.tau = 5\ntime.frames_per_slide = {FRAMES}\nflow.steps = 20\n
+        transfer.low = 0.05\ntransfer.high = 0.3\nrender.method = \"two_level\"\nsurrogate.kind = \"table\"\n",
+        SLIDES + 5
+    );
+    let setup = scene::setup(&scene::scene("turbulence", [96, 48, 1], &keys), &[]);
+    // A handle of its own, so that no other test's memory counts.
+    let gpu = opened(GpuSettings::default());
+    let steering = Arc::new(Steering::new(&setup.plan));
+    let device = Device::Cuda(CudaDevice { gpu: gpu.clone(), storage: None, when_lost: WhenLost::Stop, may_fall_back: false });
+    let options = RunOptions { device, steering: Some(Arc::clone(&steering)), ..RunOptions::default() };
+    let (mut held, mut taken, mut frames) = (VecDeque::new(), Vec::new(), 0);
+    let mut sink = |event: Event| {
+        let Event::Frame(frame) = event else { return };
+        frames += 1;
+        if frame.record.frame == FRAMES / 2 {
+            let z = 80.0 + frame.record.slide as f64;
+            let camera = json!({"eye": [24, 12, z], "look_at": [24, 12, 12], "up": [0, 1, 0], "orthographic": true});
+            steering.command(json!({"camera": camera}).as_object().unwrap()).unwrap();
+        }
+        if frame.record.frame + 1 == FRAMES {
+            taken.push(gpu.memory().0);
+        }
+        held.push_back(frame);
+        if held.len() > 8 {
+            held.pop_front();
+        }
+    };
+    run(setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
+    println!("{frames} frames, bytes at the end of each slide: {taken:?}");
+    assert_eq!((frames, taken.len() as u64), (SLIDES * FRAMES, SLIDES));
+    // The first slides fill what is kept from slide to slide.
+    assert!(taken[3..].iter().all(|bytes| *bytes == taken[3]), "{taken:?}");
 }
