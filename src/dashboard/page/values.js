@@ -103,8 +103,10 @@ async function get(url, limit, signal) {
   } catch (error) {
     throw new Error(error.name === "TimeoutError" ? "the server did not answer in time" : "the server is not reached", { cause: error });
   }
-  if (!answer.ok) throw new Error((await answer.text()).trim() || `the server answers ${answer.status}`);
-  return answer;
+  if (answer.ok) return answer;
+  // A proxy that fails answers with a page of its own.
+  const words = answer.headers.get("content-type")?.startsWith("text/plain") ? (await answer.text()).trim() : "";
+  throw new Error(words || `the server answers ${answer.status}`);
 }
 
 /** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */

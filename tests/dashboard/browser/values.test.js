@@ -1,7 +1,7 @@
 // The value under the pointer: which pixel it is, what is asked, and in which words it is told.
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Values, fieldCommand, fieldWords, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
+import { Values, asker, fieldCommand, fieldWords, fileName, pixelAt, valueWords } from "../../../src/dashboard/page/values.js";
 
 const values = {
   frame: 1200, slide: 3, x: 5, y: 7, size: [96, 48], unit: "1/s",
@@ -52,6 +52,19 @@ test("the command of a field names the slide, and of a simulation there is none"
   assert.match(fieldCommand("gulf", "ipc:///tmp/frames", record).command, / --set publish.endpoint=private --out gulf/);
   const live = fieldCommand("gulf", null, { ...record, live: { step: 5 } });
   assert.ok(live.command === null && /running simulation/.test(live.words));
+});
+
+test("the server's words are told, and of a proxy's page the status alone", async (context) => {
+  const answers = [["frame 3 is no longer kept\n", 410, "text/plain; charset=utf-8"], ["<!DOCTYPE HTML>", 599, "text/html"], ["", 502, "text/plain"]];
+  context.mock.method(globalThis, "fetch", async () => {
+    const [text, status, type] = answers.shift();
+    return new Response(text, { status, headers: { "content-type": type } });
+  });
+  globalThis.location = { href: "http://portal.example.org/proxy/8577/" };
+  const told = [];
+  while (answers.length > 0) told.push((await asker("token")({ x: 0, y: 0 })).problem);
+  delete globalThis.location;
+  assert.deepEqual(told, ["frame 3 is no longer kept", "the server answers 599", "the server answers 502"]);
 });
 
 /** With questions that the test answers. */
