@@ -3,13 +3,47 @@
 use super::common::{Common, Usage, print_json, print_text};
 use super::messages;
 use anyhow::{Context, Result, bail};
-use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
-use ridgewatch::publish::{DEFAULT_ENDPOINT, NewestFrame};
+use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token, host_name};
+use ridgewatch::publish::DEFAULT_ENDPOINT;
 use ridgewatch::steer::default_connection;
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::IpAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
+
+/// Who reaches a page: options of `dashboard`, and of a run with `--dashboard`.
+#[derive(Debug, clap::Args)]
+pub struct Reach {
+    /// Address at which the page listens, by default 127.0.0.1. Others let other machines reach it, by this address or a name of --allow-host,
+    /// without encryption.
+    #[arg(long, value_name = "ADDRESS")]
+    bind: Option<IpAddr>,
+    /// Name by which browsers reach the page through a proxy, as in their address bar; may be repeated.
+    #[arg(long, value_name = "NAME", value_parser = host_name)]
+    allow_host: Vec<String>,
+    /// Keep the page's token in this file (mode 0600), which is made if it does not exist, and print the address without it.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+impl Reach {
+    /// Settings of a page of the private endpoint. Makes the token's file if it does not exist.
+    pub fn settings(&self, port: Option<u16>) -> Result<DashboardSettings> {
+        let token = self.token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
+        let local = DashboardSettings::local(DEFAULT_ENDPOINT.to_owned(), port, token);
+        Ok(DashboardSettings { address: self.bind.unwrap_or(local.address), hosts: self.allow_host.clone(), ..local })
+    }
+
+    /// Refuses these options for a run without a page.
+    pub fn refuse_without_page(&self) -> Result<()> {
+        let bind = self.bind.map(|address| format!("--bind {address}"));
+        let host = self.allow_host.first().map(|name| format!("--allow-host {name}"));
+        let file = self.token_file.as_ref().map(|file| format!("--token-file {}", file.display()));
+        match bind.or(host).or(file) {
+            Some(option) => bail!(Usage(format!("{option}: this run has no page; accepted with --dashboard"))),
+            None => Ok(()),
+        }
+    }
+}
 
 /// Options of `dashboard`.
 #[derive(Debug, clap::Args)]
@@ -20,16 +54,8 @@ pub struct Options {
     /// Port of the page; 0: any free one. By default 8577, or any free one if that is taken.
     #[arg(long, value_name = "PORT")]
     port: Option<u16>,
-    /// Address to listen at. Others than 127.0.0.1 let other machines reach the page, by this address or a name of --allow-host, without
-    /// encryption.
-    #[arg(long, value_name = "ADDRESS", default_value_t = Ipv4Addr::LOCALHOST.into())]
-    bind: IpAddr,
-    /// Name by which browsers reach the page through a proxy, as in their address bar; may be repeated.
-    #[arg(long, value_name = "NAME")]
-    allow_host: Vec<String>,
-    /// Keep the token in this file (mode 0600), which is made if it does not exist, and print the address without it.
-    #[arg(long, value_name = "FILE")]
-    token_file: Option<PathBuf>,
+    #[command(flatten)]
+    reach: Reach,
     /// Let the page steer the run whose connection file this is (`replay --steer`, `attach --steer`); by default the one of the private socket.
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<PathBuf>>,
@@ -45,25 +71,19 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             "--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --chart".into()
         ));
     }
-    let Options { endpoint, port, bind: address, allow_host: hosts, token_file, steer, chart } = options;
+    let Options { endpoint, port, reach, steer, chart } = options;
     let steer = steer.map(|file| file.map_or_else(default_connection, Ok)).transpose()?;
-    let token = token_file.as_deref().map_or_else(|| Ok(Token::random()?), Token::in_file)?;
     let is_steered = steer.is_some();
     let read = |file: PathBuf| std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()));
     let chart = chart.map(read).transpose()?;
-    let dashboard = Dashboard::start(DashboardSettings { endpoint, address, port, hosts, token, steer, newest: None, chart })?;
-    if !address.is_loopback() {
-        messages::note(format_args!(
-            "{} is open to other machines: without encryption, whoever reads the network sees frames and token",
-            dashboard.address()
-        ));
-    }
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, steer, chart, ..reach.settings(port)? })?;
+    note_if_open(&dashboard);
     messages::note(format_args!("frames from {}", dashboard.endpoint()));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         // SIGHUP keeps its meaning: under `nohup` it is ignored.
         let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-        announce(&dashboard, common.json, token_file.is_some(), is_steered)?;
+        announce(&dashboard, common.json, &reach, is_steered)?;
         tokio::select! {
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
@@ -72,23 +92,13 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     })
 }
 
-/// Starts a dashboard beside a run that publishes at `endpoint`, keeps its newest frame, and takes commands if it has a connection file. Without one
-/// the run goes on.
-pub fn beside(
-    common: &Common,
-    endpoint: String,
-    port: Option<u16>,
-    steer: Option<PathBuf>,
-    newest: Arc<NewestFrame>,
-    chart: Option<Vec<u8>>,
-) -> Option<Dashboard> {
-    let is_steered = steer.is_some();
-    let started = Token::random().map_err(Into::into).and_then(|token| {
-        Dashboard::start(DashboardSettings { steer, newest: Some(newest), chart, ..DashboardSettings::local(endpoint, port, token) })
-    });
-    match started {
+/// Starts the dashboard of a run. Without one the run goes on.
+pub fn beside(common: &Common, reach: &Reach, settings: DashboardSettings) -> Option<Dashboard> {
+    let is_steered = settings.steer.is_some();
+    match Dashboard::start(settings) {
         Ok(dashboard) => {
-            if let Err(error) = announce(&dashboard, common.json, false, is_steered) {
+            note_if_open(&dashboard);
+            if let Err(error) = announce(&dashboard, common.json, reach, is_steered) {
                 messages::note(format_args!("the address of the dashboard cannot be printed: {error}"));
             }
             Some(dashboard)
@@ -100,9 +110,19 @@ pub fn beside(
     }
 }
 
-/// Prints the address on standard output, since standard error often goes to a log that others may read.
-fn announce(dashboard: &Dashboard, json: bool, keeps_token: bool, is_steered: bool) -> Result<()> {
+/// Warns of an address that other machines reach.
+fn note_if_open(dashboard: &Dashboard) {
     let address = dashboard.address();
+    if !address.ip().is_loopback() {
+        messages::note(format_args!(
+            "{address} is open to other machines: without encryption, whoever reads the network sees frames and token"
+        ));
+    }
+}
+
+/// Prints the address on standard output, since standard error often goes to a log that others may read.
+fn announce(dashboard: &Dashboard, json: bool, reach: &Reach, is_steered: bool) -> Result<()> {
+    let (address, keeps_token) = (dashboard.address(), reach.token_file.is_some());
     let url = if keeps_token { format!("http://{address}/") } else { dashboard.url() };
     // Where nothing is steered, one address does.
     let watching = Some(dashboard.watching_url()).filter(|_| is_steered && !keeps_token);

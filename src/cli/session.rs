@@ -4,10 +4,12 @@ use super::common::{
     Common, Interrupted, RaceFile, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text,
     seconds, text_with_tau, verifies_nothing,
 };
+use super::dashboard::{self, Reach};
 use super::signals::Stop;
-use super::{dashboard, messages, notify};
+use super::{messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
+use ridgewatch::dashboard::DashboardSettings;
 use ridgewatch::map::{MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
     DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
@@ -39,10 +41,12 @@ pub struct RunArguments {
     /// Publish frames at this ZeroMQ endpoint (port 0: any free one, which is printed); by default they go to files only.
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
     publish: Option<String>,
-    /// Show the run on a web page, on this machine only, at this port or any free one; prints its address. Frames are published for it at the
-    /// endpoint of --publish, or else where only this user reaches them.
+    /// Show the run on a web page at this port or any free one, on this machine only without --bind; prints its address. Frames are published for
+    /// it at the endpoint of --publish, or else where only this user reaches them.
     #[arg(long, value_name = "PORT", num_args = 0..=1, require_equals = true)]
     dashboard: Option<Option<u16>>,
+    #[command(flatten)]
+    reach: Reach,
     /// Accept signed commands (camera, tolerance, colours, method, budget, tau, direction, pause) at this endpoint: private, ipc://PATH or tcp://HOST:PORT. The connection file,
     /// which is printed, holds the key. With --dashboard its page steers, and without ENDPOINT another one is taken if private is in use.
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, require_equals = true)]
@@ -79,6 +83,9 @@ pub struct RunArguments {
 impl RunArguments {
     /// Applies the options to the scene.
     pub fn apply(&self, scene: &mut SceneFile) -> Result<()> {
+        if self.dashboard.is_none() {
+            self.reach.refuse_without_page()?;
+        }
         if let Some(method) = self.method {
             scene.render.method = method;
         }
@@ -134,6 +141,8 @@ impl Session<'_> {
             Err(PublishError::InUse { .. } | PublishError::Occupied { .. }) if wanted.is_some() => {}
             free => free?,
         }
+        // Also before: a token's file that others may read costs no work.
+        let page = options.dashboard.map(|port| options.reach.settings(port)).transpose()?;
         let stop = Stop::default();
         let within = options.stop_within.map(Duration::try_from_secs_f64).transpose().unwrap_or_default();
         let watch = || stop.watch(within, || ());
@@ -192,11 +201,11 @@ impl Session<'_> {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
         let newest = Arc::new(NewestFrame::of_run(&out, &setup.plan));
-        let shown = options.dashboard.zip(output.endpoint());
-        let dashboard = shown.and_then(|(port, endpoint)| {
+        let dashboard = page.zip(output.endpoint()).and_then(|(page, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
             let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());
-            dashboard::beside(common, endpoint.to_owned(), port, steer, Arc::clone(&newest), chart)
+            let (endpoint, newest) = (endpoint.to_owned(), Some(Arc::clone(&newest)));
+            dashboard::beside(common, &options.reach, DashboardSettings { endpoint, steer, newest, chart, ..page })
         });
         let newest = Some(newest).filter(|_| dashboard.is_some());
         newest.iter().for_each(|newest| output.keep_newest(Arc::clone(newest)));

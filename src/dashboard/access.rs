@@ -34,14 +34,8 @@ pub(super) struct Access {
 
 impl Access {
     pub fn new(token: Token, hosts: Vec<String>, address: SocketAddr) -> Result<Self, DashboardError> {
-        for host in &hosts {
-            // Also refuses what has a user, a port, a path or a scheme.
-            let is_name = host.parse::<Authority>().is_ok_and(|parsed| parsed.host() == host);
-            if !is_name {
-                return Err(DashboardError::HostName(host.clone()));
-            }
-        }
-        Ok(Self { watching: token.watching(), token, hosts: hosts.iter().map(|host| host.to_ascii_lowercase()).collect(), address })
+        let hosts = hosts.iter().map(|host| host_name(host)).collect::<Result<_, _>>()?;
+        Ok(Self { watching: token.watching(), token, hosts, address })
     }
 
     /// Refuses names that a stranger may have pointed at this machine (DNS rebinding).
@@ -107,6 +101,15 @@ pub(super) fn given_token(uri: &Uri) -> Option<&str> {
 /// A value of the query. Those of this server need no escapes.
 pub(super) fn parameter<'a>(uri: &'a Uri, name: &str) -> Option<&'a str> {
     uri.query().unwrap_or_default().split('&').find_map(|part| part.strip_prefix(name)?.strip_prefix('='))
+}
+
+/// The name of a host as browsers send it, in lower case.
+///
+/// # Errors
+/// Something else, such as what has a user, a port, a path or a scheme.
+pub fn host_name(text: &str) -> Result<String, DashboardError> {
+    let is_name = text.parse::<Authority>().is_ok_and(|parsed| parsed.host() == text);
+    if is_name { Ok(text.to_ascii_lowercase()) } else { Err(DashboardError::HostName(text.to_owned())) }
 }
 
 /// Value of a header that may come once.

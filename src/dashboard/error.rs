@@ -24,10 +24,10 @@ pub enum DashboardError {
         source: BindError,
     },
     /// Not a name of a host.
-    #[error("--allow-host `{0}`: accepted: the name or address of a host as browsers send it, without scheme, port or path")]
+    #[error("host `{0}`: accepted: a name or an address as browsers send it, without scheme, port or path")]
     HostName(String),
     /// The address cannot be listened at.
-    #[error("cannot listen at {address}: {source}; choose another --port, 0 for any free one")]
+    #[error("cannot listen at {address}: {source}; choose another port, 0 for any free one")]
     Listen {
         /// The address.
         address: SocketAddr,

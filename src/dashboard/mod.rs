@@ -20,6 +20,7 @@ mod server;
 mod steering;
 mod token;
 
+pub use access::host_name;
 pub use error::DashboardError;
 pub use token::Token;
 

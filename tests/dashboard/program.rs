@@ -2,9 +2,11 @@
 
 use crate::kit::program::{Outcome, Running, ridgewatch, run, set, start, text, until};
 use crate::kit::scene::{self, double_gyre};
-use crate::visitor::{Visitor, get, socket_status};
+use crate::visitor::{Visitor, ask, get, socket_status};
+use std::fs::Permissions;
 use std::net::SocketAddr;
-use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
@@ -105,6 +107,83 @@ fn a_run_shows_itself_and_goes_on_without_a_free_port() {
     let outcome = run(&mut replay("hidden", &[&port, "--publish", &endpoint, "--seconds", "0.5"])).success();
     assert!(outcome.stderr.contains("there is no dashboard: cannot listen at"), "{}", outcome.stderr);
     assert!(outcome.json()["frames"].as_u64().unwrap() > 0);
+}
+
+/// A run in this folder with these options.
+fn replay(folder: &Path, options: &[&str]) -> Command {
+    let scene = scene::write(folder, &double_gyre([32, 16, 1], "time.tau = 10\ntime.slides = 10000\nrender.method = \"reference\"\n"));
+    let endpoint = format!("ipc://{}", folder.join("frames").display());
+    let mut command = ridgewatch(["replay", &scene, "--json", "--out", text(&folder.join("run")), "--publish", &endpoint]);
+    command.args(options).args(set(&["flow.steps=20", "publish.preview=false"]));
+    command
+}
+
+#[test]
+fn a_run_is_reached_by_an_allowed_name_and_the_token_of_a_file_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("token");
+    let steer = format!("--steer=ipc://{}", folder.path().join("commands").display());
+    let options = ["--dashboard=0", &steer, "--allow-host", "Portal.example.org", "--token-file", text(&file)];
+    let running = start(&mut replay(folder.path(), &options));
+    let printed = url(&running);
+    let address: SocketAddr = printed.strip_prefix("http://").unwrap().strip_suffix('/').unwrap().parse().unwrap();
+    let token = std::fs::read_to_string(&file).unwrap().trim().to_owned();
+    assert!(address.ip().is_loopback() && file.metadata().unwrap().permissions().mode() & 0o777 == 0o600);
+    let mut visitor = Visitor::open(address, &token);
+    visitor.frame();
+    visitor.until_state(|state| state["token_to_share"].is_string());
+    let asked =
+        |host: &str| ask(address, &format!("GET /frame.json?token={token} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n")).0;
+    assert_eq!(["portal.example.org", "portal.example.org:8443", "localhost", "node.example.org"].map(asked), [200, 200, 200, 403]);
+    for (host, origin, status) in [
+        ("portal.example.org", "https://portal.example.org", 101),
+        ("localhost:8577", "https://portal.example.org", 101),
+        ("localhost:8577", "https://node.example.org", 403),
+        ("node.example.org", "https://node.example.org", 403),
+    ] {
+        let lines = [format!("Host: {host}"), format!("Origin: {origin}")];
+        assert_eq!(socket_status(address, &format!("/socket?token={token}"), &lines.each_ref().map(String::as_str)), status, "{lines:?}");
+    }
+    assert_eq!(get(address, "/frame.json", &[]).0, 403);
+    running.signal(libc::SIGTERM);
+    let outcome = running.wait();
+    assert!(!outcome.stdout.contains(&token) && !outcome.stderr.contains(&token) && !outcome.stdout.contains("watching_url"));
+    assert!(!outcome.stderr.contains("open to other machines"), "{}", outcome.stderr);
+}
+
+#[test]
+fn a_run_that_listens_for_other_machines_says_so_and_refuses_names_that_are_not_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    let running = start(&mut replay(folder.path(), &["--dashboard=0", "--bind", "0.0.0.0"]));
+    let (address, token) = parts(&url(&running));
+    assert!(address.ip().is_unspecified());
+    let near = SocketAddr::from(([127, 0, 0, 1], address.port()));
+    let asked = |host: &str| ask(near, &format!("GET /?token={token} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n")).0;
+    assert_eq!(["192.0.2.7:8577", "node.example.org:8577"].map(asked), [200, 403]);
+    running.signal(libc::SIGTERM);
+    let warning = format!("{address} is open to other machines: without encryption");
+    assert!(running.wait().stderr.contains(&warning));
+}
+
+#[test]
+fn options_of_a_page_are_refused_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, ring) = (folder.path().join("token"), folder.path().join("ring"));
+    let option = ["--token-file", text(&file)];
+    for options in [&["--bind", "0.0.0.0"], &["--allow-host", "portal.example.org"], &option] {
+        let given = options.join(" ");
+        let hints = [given.as_str(), "accepted with --dashboard"];
+        run(&mut replay(folder.path(), options)).refused(2, &hints);
+        run(ridgewatch(["attach", text(&ring), "--tau", "1"]).args(options)).refused(2, &hints);
+    }
+    assert!(!file.exists());
+    std::fs::write(&file, "a".repeat(64)).unwrap();
+    std::fs::set_permissions(&file, Permissions::from_mode(0o644)).unwrap();
+    run(replay(folder.path(), &option).arg("--dashboard")).refused(2, &["has mode 0644; accepted: a file that only its owner may read"]);
+    run(ridgewatch(["attach", text(&ring), "--tau", "1", "--dashboard"]).args(option)).refused(2, &["has mode 0644"]);
+    let name = ["--allow-host", "https://portal.example.org"];
+    run(replay(folder.path(), &name).arg("--dashboard")).refused(2, &["--allow-host", "without scheme, port or path"]);
+    assert!(!folder.path().join("run").exists());
 }
 
 #[test]
