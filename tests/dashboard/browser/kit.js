@@ -27,8 +27,8 @@ const SMALL = {
   "render.width": 96, "render.height": 48, "render.samples": 1, "render.budget": 50, "time.slides": 5000, "publish.exr": '"none"', "publish.preview": false,
 };
 
-export function launch() {
-  return chromium.launch({ executablePath: CHROMIUM, args: FLAGS });
+export function launch(...more) {
+  return chromium.launch({ executablePath: CHROMIUM, args: [...FLAGS, ...more] });
 }
 
 /** A folder that is removed at the end of the tests. */
