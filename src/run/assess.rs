@@ -1,6 +1,7 @@
 //! The error of a frame's surrogate on its audit points, and the consequences for trust, size and replay buffer.
 
 use super::cycle::{MAX_RENDER_RESIDUALS, Run};
+use super::frame::gate_decides;
 use super::prepare::every;
 use super::stop::RunEnd;
 use super::transaction::On;
@@ -88,7 +89,7 @@ impl Run<'_> {
                 .warnings
                 .push(format!("the tracing budget was spent: {over_budget} queries of untrusted cells were answered by the surrogate"));
         }
-        if self.render.method == Method::Gated
+        if gate_decides(self.render.method, on.surrogate.as_ref())
             && let Some(error) = trusted
         {
             let evidence = learning.trust.weigh(&error);

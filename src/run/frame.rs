@@ -174,10 +174,10 @@ impl Run<'_> {
                 set.map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?
             }
         };
-        // As many as take as long as the samples. A surrogate with a table is as good as that where it is not trusted.
+        // As many as take as long as the samples.
         let a_sample = backend.nodes_per_sample()[1] * self.render.width * self.render.height;
         let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
-        let traced_nodes = if learns && table_nodes.is_none() { (a_sample as f64 * samples) as usize } else { 0 };
+        let traced_nodes = if gate_decides(method, surrogate) { (a_sample as f64 * samples) as usize } else { 0 };
         Ok(Some(Smooth { method, sum: self.plan.scene.render.combine == Combine::Sum, nodes, traced_nodes }))
     }
 
@@ -410,6 +410,13 @@ impl Run<'_> {
             ..FrameRecord::default()
         }
     }
+}
+
+/// True if the gate decides what is traced: queries of `gated`, and nodes on which a smooth picture lays out a network. A surrogate with a
+/// table is as good as that where it is not trusted.
+pub(super) fn gate_decides<S: Surrogate>(method: Method, surrogate: Option<&S>) -> bool {
+    let is_network = surrogate.is_some_and(|surrogate| surrogate.learns() && surrogate.table_nodes().is_none());
+    method == Method::Gated || method.is_smooth() && is_network
 }
 
 /// Box of the seeds, with the axes of the data.

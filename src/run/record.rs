@@ -78,7 +78,8 @@ pub struct FrameRecord {
     /// Error of the surrogate on audit points of the trusted region. `None` if nothing is trusted.
     pub trusted_error: Option<TrustedError>,
     /// Evidence, an e-value, against the hypothesis that the mean square optical residual of the trusted region was within the tolerance squared in
-    /// every frame since the run began or the gate was last reset. At 20 or above the gate is reset. `None` if the method has no gate.
+    /// every frame since the run began or the gate was last reset. At 20 or above the gate is reset. `None` if nothing is trusted, or if the gate
+    /// decides nothing: it does for `gated`, and for `marched` and `two_level` with a network.
     pub gate_evidence: Option<f64>,
     /// PSNR in decibels of the surrogate over the whole domain, on the audit points; peak: their largest traced log-stretch. `None` for
     /// `reference`.

@@ -3,8 +3,18 @@
 use crate::kit::program::{self, text};
 use crate::kit::scene;
 use crate::ridgewatch;
-use ridgewatch::run::FrameRecord;
-use ridgewatch::trust::TrustedError;
+use ridgewatch::backend::{
+    AuditFindings, AuditRequest, Backend, BackendError, Cpu, DeviceError, FrameJob, FrozenOf, HostFrame, HostPicture, Rendered,
+    SurrogateRequest, audit, render_on_cpu,
+};
+use ridgewatch::field::UnitPoint;
+use ridgewatch::flow::{FlowMap, Tracer, VelocitySource};
+use ridgewatch::render::Renderer;
+use ridgewatch::run::{Event, FrameRecord, RunOptions, run_on};
+use ridgewatch::source::Listener;
+use ridgewatch::surrogate::{HostSurrogate, Predict, Samples};
+use ridgewatch::trust::{REJECTED, TrustedError};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Records of a run with fixed numbers of training steps and fixed seeds: the same on every machine, except for rounding.
 fn records(options: &[&str]) -> Vec<FrameRecord> {
@@ -76,4 +86,131 @@ fn a_spent_tracing_budget_is_said_and_flagged() {
     }
     // The untrained network is far off where it is not trusted, and the frame states the excess.
     assert!(spent[0].tolerance_excess.unwrap() > 0.0, "{:?}", spent[0].tolerance_excess);
+}
+
+/// A surrogate that predicts a large log-stretch everywhere.
+struct Corrupted<'a>(&'a dyn Predict);
+
+impl Predict for Corrupted<'_> {
+    fn name(&self) -> &'static str {
+        self.0.name()
+    }
+    fn predict(&self, points: &[UnitPoint], out: &mut [f32]) -> Result<(), DeviceError> {
+        self.0.predict(points, out)?;
+        out.iter_mut().for_each(|log_stretch| *log_stretch += 10.0);
+        Ok(())
+    }
+    fn bytes(&self) -> usize {
+        self.0.bytes()
+    }
+}
+
+/// The CPU, whose surrogate is corrupted while the flag is set.
+struct Corrupting<'a>(&'a AtomicBool);
+
+impl Corrupting<'_> {
+    /// Calls `then` with the surrogate as it is now.
+    fn with<T>(&self, surrogate: Option<&dyn Predict>, then: impl FnOnce(Option<&dyn Predict>) -> T) -> T {
+        let corrupted = surrogate.filter(|_| self.0.load(Ordering::Relaxed)).map(Corrupted);
+        then(corrupted.as_ref().map(|corrupted| corrupted as &dyn Predict).or(surrogate))
+    }
+}
+
+impl Backend for Corrupting<'_> {
+    type Tracer = Box<dyn Tracer>;
+    type Surrogate = HostSurrogate;
+    type Samples = Samples;
+    type Picture = HostPicture;
+
+    fn name(&self) -> String {
+        "cpu".into()
+    }
+    fn prefetch(&self) -> Option<Listener> {
+        None
+    }
+    fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<Self::Tracer, BackendError> {
+        Cpu.tracer(velocity, map, t0)
+    }
+    fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &Self::Tracer) -> Result<HostSurrogate, BackendError> {
+        Cpu.surrogate(request, tracer)
+    }
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut HostPicture,
+    ) -> Result<Rendered<Samples>, DeviceError> {
+        let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
+        self.with(surrogate, |surrogate| render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer, picture))
+    }
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &Self::Tracer,
+        surrogate: Option<&FrozenOf<Self>>,
+    ) -> Result<AuditFindings, DeviceError> {
+        let surrogate = surrogate.map(|surrogate| surrogate as &dyn Predict);
+        self.with(surrogate, |surrogate| audit::audit(request, tracer, surrogate))
+    }
+    fn replan(&mut self, _: &DeviceError, _: &Self::Tracer, _: &mut Option<HostSurrogate>) -> Result<Option<String>, DeviceError> {
+        Ok(None)
+    }
+}
+
+/// Records of a picture that stands still, whose surrogate is corrupted from a frame on.
+fn standing(method: &str, kind: &str, corrupted_from: Option<u64>) -> Vec<FrameRecord> {
+    let keys = format!(
+        "
+        time.tau = 5
+        time.frames_per_slide = 8
+        flow.steps = 50
+        training.steps_per_frame = 100
+        render.method = \"{method}\"
+        surrogate.kind = \"{kind}\"
+        {}",
+        scene::SMALL_NETWORK
+    );
+    let setup = scene::setup(&scene::double_gyre([32, 16, 4], &keys), &[]);
+    let is_corrupted = AtomicBool::new(corrupted_from == Some(0));
+    let mut records = Vec::new();
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            let next = frame.record.frame + 1;
+            is_corrupted.store(corrupted_from.is_some_and(|first| next >= first), Ordering::Relaxed);
+            records.push((*frame.record).clone());
+        }
+    };
+    let options = RunOptions { threads: 2, ..RunOptions::default() };
+    run_on(Corrupting(&is_corrupted), setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
+    records
+}
+
+/// The gate chooses the nodes that a smooth picture traces for a network, so that it is weighed there as in `gated`.
+#[test]
+fn the_gate_of_a_smooth_picture_is_weighed_if_it_decides_what_is_traced() {
+    for (method, kind, decides) in
+        [("two_level", "network", true), ("marched", "network", true), ("two_level", "residual", false), ("two_level", "table", false)]
+    {
+        let records = standing(method, kind, None);
+        assert!(records.len() == 8 && records.iter().any(|record| record.trusted_error.is_some()), "{method}, {kind}: nothing is trusted");
+        for record in &records {
+            let is_weighed = decides && record.trusted_error.is_some();
+            assert_eq!(record.gate_evidence.is_some(), is_weighed, "{method}, {kind}, frame {}", record.frame);
+        }
+    }
+}
+
+#[test]
+fn a_corrupted_network_of_a_smooth_picture_is_found_in_a_frame() {
+    let healthy = standing("two_level", "network", None);
+    // Nothing speaks against a gate that is open. The first frames are those of a network that was hardly trained.
+    let is_open = |record: &FrameRecord| record.trusted_volume > 0.1 && record.gate_evidence.is_some_and(|evidence| evidence < 1.0);
+    let first = (2..healthy.len() - 1).find(|&frame| is_open(&healthy[frame])).expect("a tenth of the domain is trusted");
+    let records = standing("two_level", "network", Some(first as u64));
+    let [found, next] = [&records[first], &records[first + 1]];
+    assert_eq!(found.trusted_volume, healthy[first].trusted_volume, "the gate was chosen before");
+    let is_said = |record: &FrameRecord| record.warnings.iter().any(|warning| warning.contains("every cell must earn trust again"));
+    assert!(found.gate_evidence.unwrap() >= REJECTED && is_said(found) && !is_said(&healthy[first]), "{:?}", found.gate_evidence);
+    // A large log-stretch is right only where the transfer function is saturated.
+    assert!(next.trusted_volume < 0.25 * found.trusted_volume, "{} trusted, then {}", found.trusted_volume, next.trusted_volume);
 }
