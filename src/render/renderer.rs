@@ -45,6 +45,8 @@ pub struct RenderStats {
     pub evaluate_seconds: f64,
     /// Seconds of both by the clock of the device that tracked the frame; 0 for the CPU.
     pub device_seconds: f64,
+    /// Wall-clock seconds of the coupled samples of a smooth frame; 0 for other frames.
+    pub sample_seconds: f64,
     /// True if `stop` ended the frame early. Unfinished pixels have 0 samples.
     pub stopped: bool,
 }

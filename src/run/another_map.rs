@@ -152,7 +152,7 @@ impl<B: Backend> Cycle<'_, B> {
             VelocitySource::Window(window) => Some(self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?),
             VelocitySource::Analytic(..) => None,
         };
-        self.run.progress.seconds_per_sample = None;
+        self.run.progress.cost = None;
         self.run.progress.steps_shown = 0;
         self.run.progress.has_warned_of_deaths = false;
         if with!(&self.session, on => on.surrogate.is_some()) {

@@ -92,7 +92,7 @@ impl Run<'_> {
         if let Some(method) = set.method {
             Decision::withdraw(&mut self.report.decisions, &["render.method"]);
             // Of another method.
-            self.progress.seconds_per_sample = None;
+            self.progress.cost = None;
             // A budget waits for the method that has one.
             self.render = drawn_by(&self.plan.scene.render, method, self.budget);
         }

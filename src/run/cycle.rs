@@ -4,6 +4,7 @@
 //! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
 //! with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
+use super::budget::FrameCost;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
 use super::decision::{Decision, enter_colours, suited_network, why_steps};
@@ -236,8 +237,8 @@ pub(super) struct RunProgress {
     pub(super) warnings: Vec<String>,
     /// Optimizer steps of the surrogate that the accumulating picture shows.
     pub(super) steps_shown: u64,
-    /// Seconds of a coupled sample a pixel in the last smooth frame; `None` before it.
-    pub(super) seconds_per_sample: Option<f64>,
+    /// Seconds that smooth frames take; `None` before the first one.
+    pub(super) cost: Option<FrameCost>,
     /// Seconds that the loop paused since the last frame for a checkpoint.
     pub(super) checkpoint_pause: f64,
     /// Commands that took effect since the last frame.
@@ -261,12 +262,13 @@ impl RunProgress {
         self.commands.retain(|command| !command.set.is_empty());
     }
 
-    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows.
-    pub(super) fn affordable_samples(&self, settings: &RenderSettings) -> f64 {
+    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows, of which `refining` seconds
+    /// went to a finer table.
+    pub(super) fn affordable_samples(&self, settings: &RenderSettings, refining: f64) -> f64 {
         /// Samples a pixel of the first frame with a budget, whose cost is not known.
         const FIRST: f64 = 0.25;
         let Some(milliseconds) = settings.budget else { return settings.samples };
-        let affordable = self.seconds_per_sample.map_or(FIRST, |seconds| 1e-3 * milliseconds / seconds);
+        let affordable = self.cost.map_or(FIRST, |cost| cost.samples(1e-3 * milliseconds, refining));
         // An even sixteenth at least, so that every tile gets samples.
         affordable.clamp(1.0 / 16.0, 4096.0)
     }

@@ -1,6 +1,7 @@
 //! One frame: rendering with frozen weights while the live ones train, comparison with the traced samples, and the record.
 
 use super::assess::{Work, assess};
+use super::budget::FrameCost;
 use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
 use super::record::{DomainRecord, Frame};
@@ -10,7 +11,9 @@ use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
-use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, StartsAnew, Surrogate};
+use crate::backend::{
+    AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Rendered, Routing, Smooth, StartsAnew, Surrogate,
+};
 use crate::field::Domain;
 use crate::flow::VelocitySource;
 use crate::progress;
@@ -88,7 +91,9 @@ impl Run<'_> {
         record.verified_error = verified;
         record.picture_error = work.rendered.error;
         if method.is_smooth() {
-            self.progress.seconds_per_sample = Some(work.render_seconds / work.samples_per_pixel);
+            let Rendered { stats, tally, .. } = &work.rendered;
+            let cost = FrameCost::new(work.render_seconds, work.samples_per_pixel, stats, tally);
+            self.progress.cost = Some(cost.after(self.progress.cost));
         }
         let samples = work.rendered.samples.commit();
         if let Some(assessment) = assessment {
@@ -214,7 +219,7 @@ impl Run<'_> {
             // Its samples only measure the error.
             _ if method == Method::Marched => 2.0 * AUDIT_PAIRS,
             Some(samples) => samples as f64,
-            None => self.progress.affordable_samples(&self.render),
+            None => self.progress.affordable_samples(&self.render, picture.place.refining),
         };
         let smooth = self.smooth(backend, surrogate.as_ref(), method, samples_per_pixel)?;
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };

@@ -5,6 +5,7 @@
 
 mod another_map;
 mod assess;
+mod budget;
 mod checkpoints;
 mod color_bar;
 mod commands;

@@ -2,7 +2,8 @@
 //!
 //! The table of a new window has few nodes, so that its first picture comes soon. From then on nodes and samples share the time: finer nodes take more
 //! error away than the samples that could be drawn meanwhile (docs/smooth.md has the measurements). The part that a frame traces and the choice to begin
-//! follow from counts of nodes, samples and frames, never from a clock, so that a run can be repeated.
+//! follow from counts of nodes, samples and frames, not from a clock, so that a run can be repeated; with a budget, whose samples follow the
+//! clock as well, from the time that a traced point takes.
 
 use super::cycle::{Cycle, Run};
 use super::decision::Decision;
@@ -30,7 +31,7 @@ pub(super) struct Frames {
 /// Nodes of a finer table for a frame.
 #[derive(Debug, Clone, Copy)]
 struct NodesPerFrame {
-    /// As many as its samples are worth.
+    /// As many as its samples are worth, or as its budget allows.
     worth: f64,
     /// As many as take as long as its samples.
     as_long: f64,
@@ -71,11 +72,23 @@ struct Refined {
 }
 
 impl Run<'_> {
-    /// Whether tables are refined: those of smooth pictures whose nodes and time the scene leaves open.
+    /// Whether tables are refined: those of smooth pictures whose nodes the scene leaves open.
     fn refines(&self) -> bool {
         let settings = &self.plan.scene.surrogate;
-        let is_open = settings.refine && settings.table_nodes.is_none() && self.learning.sizing.is_none() && self.render.budget.is_none();
+        let is_open = settings.refine && settings.table_nodes.is_none() && self.learning.sizing.is_none();
         is_open && settings.kind == Kind::Table && self.render.method.is_smooth() && !self.progress.lacks_room_for_nodes
+    }
+
+    fn nodes_per_frame<B: Backend>(&self, backend: &B) -> NodesPerFrame {
+        let RenderSettings { width, height, samples, method, budget, .. } = self.render;
+        if let Some(milliseconds) = budget {
+            let nodes = self.progress.cost.map_or(0.0, |cost| cost.nodes(1e-3 * milliseconds));
+            return NodesPerFrame { worth: nodes, as_long: nodes };
+        }
+        // The samples of `marched` only measure its error.
+        let samples = if method == Method::Marched { 1.0 } else { samples };
+        let [worth, as_long] = backend.nodes_per_sample().map(|nodes| (width * height * nodes) as f64 * samples);
+        NodesPerFrame { worth, as_long }
     }
 
     /// Traces part of a finer table, if frames enough will show it.
@@ -85,14 +98,11 @@ impl Run<'_> {
         let Some(from) = surrogate.table_nodes() else { return Ok(None) };
         let to = halved_cells(from);
         let all: usize = to.iter().product();
-        let RenderSettings { width, height, samples, method, .. } = self.render;
-        // The samples of `marched` only measure its error.
-        let samples = if method == Method::Marched { 1.0 } else { samples };
-        let [worth, as_long] = backend.nodes_per_sample().map(|nodes| (width * height * nodes) as f64 * samples);
+        let per_frame = self.nodes_per_frame(backend);
         let part = match surrogate.finer_nodes() {
-            Some(begun) if begun == to => (worth as usize).max(1),
+            Some(begun) if begun == to => (per_frame.worth as usize).max(1),
             _ if all > backend.most_refined_nodes() => 0,
-            _ => frames.part(all, NodesPerFrame { worth, as_long }),
+            _ => frames.part(all, per_frame),
         };
         if part == 0 {
             return Ok(None);

@@ -121,7 +121,8 @@ impl Picture {
         let mut marching = self.march(&medium, tone_map, round);
         let sampling = Instant::now();
         let Some(mut stats) = self.sample(&medium, round, wave_flights, answers) else { return self.stopped() };
-        let allowed = sampling.elapsed().as_secs_f64().max(MIN_MARCH_SECONDS);
+        stats.sample_seconds = sampling.elapsed().as_secs_f64();
+        let allowed = stats.sample_seconds.max(MIN_MARCH_SECONDS);
         let how = match (round.method, round.sum) {
             (Method::Marched, _) => Correction::Left,
             (_, true) => Correction::Summed,

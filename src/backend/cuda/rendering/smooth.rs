@@ -179,7 +179,9 @@ impl GpuSmooth {
         self.settle(round, renderer, answers)?;
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
+        let sampling = Instant::now();
         let mut stats = self.track(round, renderer, answers)?;
+        stats.sample_seconds = sampling.elapsed().as_secs_f64();
         let allowed = (stats.walk_seconds + stats.evaluate_seconds).max(MIN_MARCH_SECONDS);
         let settings = &renderer.scene().settings;
         let (width, height, tone_map) = (settings.width, settings.height, settings.tone_map);
