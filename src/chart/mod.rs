@@ -19,7 +19,7 @@ mod verdict;
 pub use draw::{Curve, DrawError, write_epochs, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{Front, FtlePanel, FtlePoint};
-pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, picture_errors};
+pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, most_wrong, picture_errors};
 pub use scaling::{ScalingPanel, ScalingPoint};
 pub use still::fixed_colours;
 pub use table::csv;

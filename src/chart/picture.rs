@@ -146,6 +146,32 @@ impl Truth {
         mean.accumulate(&halves[1])?;
         Ok(Self { halves, mean })
     }
+
+    /// True if a pixel is lit: its opacity is above [`LIT`].
+    pub fn is_lit(&self, pixel: usize) -> bool {
+        self.halves[0].rgba[pixel][3] + self.halves[1].rgba[pixel][3] > 2.0 * LIT
+    }
+
+    /// Squared error of a pixel, mean over the channels, linear radiance: the product of the differences to the halves, whose noise has a mean of 0
+    /// in it.
+    pub fn squared_error(&self, film: &Film, pixel: usize) -> f64 {
+        let [shown, a, b] = [film, &self.halves[0], &self.halves[1]].map(|film| film.rgba[pixel]);
+        (0..3).map(|k| f64::from(shown[k] - a[k]) * f64::from(shown[k] - b[k])).sum::<f64>() / 3.0
+    }
+
+    /// [`most_wrong`] of the picture of a surrogate.
+    pub fn most_wrong(&self, surrogate: &Film) -> Vec<usize> {
+        most_wrong(&self.mean.luminances(), &surrogate.luminances())
+    }
+}
+
+/// The twentieth of the pixels in which the luminance of a surrogate's picture is most wrong: thin ridges, which nodes smooth.
+pub fn most_wrong(truth: &[f64], surrogate: &[f64]) -> Vec<usize> {
+    let wrong: Vec<f64> = truth.iter().zip(surrogate).map(|(truth, surrogate)| (truth - surrogate).abs()).collect();
+    let mut pixels: Vec<usize> = (0..wrong.len()).collect();
+    pixels.sort_by(|&a, &b| wrong[b].total_cmp(&wrong[a]));
+    pixels.truncate(wrong.len() / 20);
+    pixels
 }
 
 /// Errors of a picture.
@@ -199,7 +225,7 @@ pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> Picture
             sums.mapped[1][0] += (tone(c) - tone(mean)).powi(2) / 3.0 - noise;
             sums.mapped[1][1] += noise;
         }
-        if a.rgba[i][3] + b.rgba[i][3] > 2.0 * LIT {
+        if truth.is_lit(i) {
             ErrorSums { mapped: [sums.mapped[1]; 2], lit: 1.0, ..sums }
         } else {
             ErrorSums { mapped: [[0.0; 2], sums.mapped[1]], ..ErrorSums::default() }

@@ -106,6 +106,11 @@ impl Film {
         self.rgba.iter().flat_map(|p| [map(p[0]), map(p[1]), map(p[2])]).collect()
     }
 
+    /// Rec. 709 luminance of every pixel.
+    pub fn luminances(&self) -> Vec<f64> {
+        self.rgba.iter().map(|[r, g, b, _]| f64::from(0.2126 * r + 0.7152 * g + 0.0722 * b)).collect()
+    }
+
     /// Merges other samples of the same frame (a later pass or another rank), weighted by sample counts.
     ///
     /// # Errors

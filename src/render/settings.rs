@@ -7,7 +7,7 @@ use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// Factor by which the upper end of the interval of the mean square error may miss `until`: 0.8 dB.
-const UNTIL_SLACK: f64 = 1.2;
+pub const UNTIL_SLACK: f64 = 1.2;
 /// Largest number of frames that `until` gives a slide.
 pub const MAX_FRAMES_UNTIL: usize = 4096;
 /// Largest picture edge, in pixels.

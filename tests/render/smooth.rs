@@ -1,6 +1,7 @@
 //! Smooth pictures: marching and coupled samples against tracking, and the error that they state.
 
 use crate::NEVER;
+use ridgewatch::chart::most_wrong;
 use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, RaySum, Refinement, ToLight};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
@@ -116,11 +117,11 @@ fn converged(medium: &Medium<'_>) -> Film {
 fn deviations(found: &Film, truth: &Film, variance: impl Fn(usize) -> f64) -> (f64, f64) {
     const BLOCK: usize = 8;
     let (mut square, mut count, mut most) = (0.0, 0.0, 0.0_f64);
+    let [shown, expected] = [found, truth].map(Film::luminances);
     for y in (0..truth.height).step_by(BLOCK) {
         for x in (0..truth.width).step_by(BLOCK) {
             let block: Vec<usize> = (0..BLOCK * BLOCK).map(|i| (y + i / BLOCK) * truth.width + x + i % BLOCK).collect();
-            let luminance = |p: [f32; 4]| f64::from(0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2]);
-            let difference: f64 = block.iter().map(|&i| luminance(found.rgba[i]) - luminance(truth.rgba[i])).sum();
+            let difference: f64 = block.iter().map(|&i| shown[i] - expected[i]).sum();
             let spread: f64 = block.iter().map(|&i| f64::from(truth.variance[i]) + variance(i)).sum();
             if spread > 0.0 {
                 let deviation = difference / spread.sqrt();
@@ -257,17 +258,10 @@ fn the_sum_of_march_and_correction_is_the_traced_picture() {
     }
 }
 
-fn luminances(film: &Film) -> Vec<f64> {
-    film.rgba.iter().map(|p| f64::from(0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2])).collect()
-}
-
 /// Deviation of the mean of pictures from the truth: over the picture, over the twentieth of the pixels in which `surrogate` is most wrong, and over each
 /// tile of 16 x 16 pixels. Each as a difference of luminance and its standard error, from the scatter between pictures.
 fn biases(pictures: &[Vec<f64>], truth: &[f64], surrogate: &[f64], width: usize) -> Vec<[f64; 2]> {
     const TILE: usize = 16;
-    let mut worst: Vec<usize> = (0..truth.len()).collect();
-    worst.sort_by(|&a, &b| (truth[b] - surrogate[b]).abs().total_cmp(&(truth[a] - surrogate[a]).abs()));
-    worst.truncate(truth.len() / 20);
     let tile = |x: usize, y: usize| (0..TILE * TILE).map(|i| (y + i / TILE) * width + x + i % TILE).collect::<Vec<_>>();
     let tiles = (0..truth.len() / width).step_by(TILE).flat_map(|y| (0..width).step_by(TILE).map(move |x| tile(x, y)));
     let mean = |pixels: &[usize], values: &[f64]| pixels.iter().map(|&i| values[i]).sum::<f64>() / pixels.len() as f64;
@@ -277,7 +271,7 @@ fn biases(pictures: &[Vec<f64>], truth: &[f64], surrogate: &[f64], width: usize)
         let bias = of_pictures.iter().sum::<f64>() / n;
         [bias, (of_pictures.iter().map(|d| (d - bias).powi(2)).sum::<f64>() / (n - 1.0) / n).sqrt()]
     };
-    [(0..truth.len()).collect(), worst].into_iter().chain(tiles).map(deviation).collect()
+    [(0..truth.len()).collect(), most_wrong(truth, surrogate)].into_iter().chain(tiles).map(deviation).collect()
 }
 
 /// Whatever the surrogate, and however coarse the march: the mean of `combine = "sum"` is the picture of the traced field. Coupled to another surrogate, or
@@ -294,7 +288,7 @@ fn corrections_of_any_surrogate_are_unbiased() {
     let traced = nodes(&domain, [33; 3], field);
     let converged_of = |nodes: &Nodes| {
         let renderer = Renderer::new(scene.clone(), &domain, TAU).unwrap();
-        luminances(&converged(&Medium { scene: &renderer.frame_scene(0), nodes, missing: None }))
+        converged(&Medium { scene: &renderer.frame_scene(0), nodes, missing: None }).luminances()
     };
     let truth = converged_of(&traced);
     let beyond = |found: &[[f64; 2]]| found.iter().filter(|[bias, error]| bias.abs() > LIMIT * error).count();
@@ -310,7 +304,7 @@ fn corrections_of_any_surrogate_are_unbiased() {
         let picture = |seed: u64| {
             let mut smooth = Smooth::new(&Scene { seed: 1000 + seed, ..scene.clone() }, &domain);
             let round = (Method::TwoLevel, true, SAMPLES);
-            luminances(&smooth.round(&surrogate, None, round, |p: DomainPoint| traced.at(domain.to_unit(p))).0)
+            smooth.round(&surrogate, None, round, |p: DomainPoint| traced.at(domain.to_unit(p))).0.luminances()
         };
         let pictures: Vec<Vec<f64>> = (0..SEEDS).map(picture).collect();
         let found = biases(&pictures, &truth, &base, WIDTH);
@@ -343,7 +337,7 @@ fn corrections_of_any_surrogate_are_unbiased() {
                 let [red, green, blue] = sum.radiance;
                 *rgba = [red, green, blue, sum.alpha].map(|c| c / 16.0);
             }
-            luminances(&film)
+            film.luminances()
         };
         biases(&(0..SEEDS).map(of_seed).collect::<Vec<_>>(), &expected, &truth, WIDTH)
     };
