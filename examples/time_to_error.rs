@@ -1,10 +1,10 @@
 //! Measures the time to error after a slide: the seconds from a new window until the picture has 30, 35, 40 and 45 dB over lit pixels and keeps them, for
 //! five slides seen by three cameras. Runs on a GPU if there is one. Prints a table.
 //!
-//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [table.key=value]`: frames a slide; a method of smooth frames or `reference`, with
-//! samples per pixel and frame of its own if given. The truth is the mean of two halves of `reference`; the product of the differences to the halves is
-//! the squared error without their noise, up to a bound that their samples set. The first slide, which compiles kernels, is not counted. The source needs
-//! six slides.
+//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [table.key=value]`: frames a slide; a method of smooth frames, `gated` or
+//! `reference`, with samples per pixel and frame of its own if given. The truth is the mean of two halves of `reference`; the product of the
+//! differences to the halves is the squared error without their noise, up to a bound that their samples set. The first slide, which compiles
+//! kernels, is not counted. The source needs six slides.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -66,7 +66,9 @@ impl Candidate {
     fn parse(word: &str) -> Self {
         let (name, samples) = word.split_once('*').map_or((word, None), |(name, samples)| (name, Some(samples.parse().unwrap())));
         let (method, kind) = name.split_once(':').unwrap_or((name, "table"));
-        let method = [Method::Reference, Method::Marched, Method::TwoLevel].into_iter().find(|known| known.name() == method).unwrap();
+        let known = [Method::Reference, Method::Gated, Method::Marched, Method::TwoLevel];
+        let found = known.into_iter().find(|known| known.name() == method);
+        let method = found.unwrap_or_else(|| panic!("a method `{method}`; accepted: {}", known.map(Method::name).join(", ")));
         let kind = match kind {
             "table" => Kind::Table,
             "residual" => Kind::Residual,
@@ -77,11 +79,11 @@ impl Candidate {
     }
 }
 
-/// Seconds to each target in a slide, and the decibels of its last frame.
+/// Seconds to each target in a slide, and the decibels of its last frame, over lit pixels and over all.
 #[derive(Default, Clone)]
 struct Found {
     reached: [Option<f64>; TARGETS.len()],
-    last: f64,
+    last: [f64; 2],
     seconds: f64,
     frames: usize,
 }
@@ -98,9 +100,10 @@ fn measure(scene: &Settings, truths: &[Truth], device: &Device) -> Vec<Found> {
         slide.seconds += frame.record.seconds.slide + frame.record.seconds.total;
         slide.frames += 1;
         let own = !scene.render.method.is_smooth() && sum.accumulate(&frame.film).is_ok();
-        slide.last = picture_errors(if own { &sum } else { &frame.film }, &truths[number], frame.tone_map).psnr;
+        let errors = picture_errors(if own { &sum } else { &frame.film }, &truths[number], frame.tone_map);
+        slide.last = [errors.psnr, errors.psnr_all];
         for (target, reached) in TARGETS.iter().zip(&mut slide.reached) {
-            *reached = if slide.last < *target { None } else { reached.or(Some(slide.seconds)) };
+            *reached = if slide.last[0] < *target { None } else { reached.or(Some(slide.seconds)) };
         }
     });
     found
@@ -144,10 +147,10 @@ fn main() {
         SLIDES - 1,
     );
     println!(
-        "\n| method | samples a frame | {} | last frame: seconds | dB, median (lowest) |",
+        "\n| method | samples a frame | {} | last frame: seconds | dB over lit pixels, median (lowest) | over all |",
         TARGETS.map(|t| format!("{t:.0} dB")).join(" | ")
     );
-    println!("|{}", "---|".repeat(TARGETS.len() + 4));
+    println!("|{}", "---|".repeat(TARGETS.len() + 5));
     for (candidate, found) in candidates.iter().zip(&all) {
         let reached = (0..TARGETS.len()).map(|target| {
             let seconds: Vec<f64> = found.iter().filter_map(|slide| slide.reached[target]).collect();
@@ -158,16 +161,17 @@ fn main() {
             }
         });
         let reached: Vec<String> = reached.collect();
-        let mut last: Vec<f64> = found.iter().map(|slide| slide.last).collect();
-        last.sort_by(f64::total_cmp);
+        let [lit, all] = [0, 1].map(|which| {
+            let mut last: Vec<f64> = found.iter().map(|slide| slide.last[which]).collect();
+            last.sort_by(f64::total_cmp);
+            format!("{:.2} ({:.2})", last[last.len() / 2], last[0])
+        });
         println!(
-            "| {} | {} | {} | {} | {:.2} ({:.2}) |",
+            "| {} | {} | {} | {} | {lit} | {all} |",
             candidate.name.split('*').next().unwrap_or_default(),
             candidate.samples.unwrap_or(scene.render.samples),
             reached.join(" | "),
             summary(found.iter().map(|slide| slide.seconds).collect()),
-            last[last.len() / 2],
-            last[0],
         );
     }
 }
