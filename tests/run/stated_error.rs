@@ -188,9 +188,7 @@ fn standing(method: &str, kind: &str, corrupted_from: Option<u64>) -> Vec<FrameR
 /// The gate chooses the nodes that a smooth picture traces for a network, so that it is weighed there as in `gated`.
 #[test]
 fn the_gate_of_a_smooth_picture_is_weighed_if_it_decides_what_is_traced() {
-    for (method, kind, decides) in
-        [("two_level", "network", true), ("marched", "network", true), ("two_level", "residual", false), ("two_level", "table", false)]
-    {
+    for (method, kind, decides) in [("two_level", "network", true), ("marched", "network", true), ("two_level", "residual", false)] {
         let records = standing(method, kind, None);
         assert!(records.len() == 8 && records.iter().any(|record| record.trusted_error.is_some()), "{method}, {kind}: nothing is trusted");
         for record in &records {
