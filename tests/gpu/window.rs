@@ -370,6 +370,6 @@ fn memory_is_flat_over_a_thousand_frames_of_smooth_pictures() {
     run(setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
     println!("{frames} frames, bytes at the end of each slide: {taken:?}");
     assert_eq!((frames, taken.len() as u64), (SLIDES * FRAMES, SLIDES));
-    // The first slides fill what is kept from slide to slide.
-    assert!(taken[3..].iter().all(|bytes| *bytes == taken[3]), "{taken:?}");
+    // The first slides fill what is kept from slide to slide; before the last ones fewer snapshots wait.
+    assert!(taken[6..].iter().all(|bytes| *bytes <= taken[5]), "{taken:?}");
 }
