@@ -180,6 +180,7 @@ fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
 /// A table too coarse to show the field's waves, which are in every pixel and in all scales of the transform. Fails if gains do not go to
 /// 1, or if marching does not become finer with the samples.
 #[test]
+#[allow(clippy::print_stdout)]
 fn a_shrunk_correction_converges_with_its_samples() {
     const WIDTH: usize = 32;
     /// Pictures of 1, 4, 16, ... 4096 samples a pixel; that of 64.

@@ -161,7 +161,7 @@ impl NetworkSettings {
 
     /// With sizes for training on a GPU over a window of `shape` nodes along x, y, z, where they are not given. A few fine levels learn a large
     /// window soonest: the finest has two thirds as many cells as the window has nodes along its longest axis, and the table holds its nodes.
-    /// Found by trials on 600x192x192 nodes. Windows of two dimensions or with fewer than [`FEW_NODES`] along the longest axis keep the defaults.
+    /// Found by trials on 600x192x192 nodes. Windows of two dimensions or with fewer than 96 nodes along the longest axis keep the defaults.
     #[must_use]
     pub fn suited_to(&self, shape: [usize; 3]) -> Self {
         let longest = shape.into_iter().max().unwrap_or(1);
