@@ -597,12 +597,15 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
             if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
                 break;
             }
-            let before = lessons.steps;
+            let (before, is_late) = (lessons.steps, lessons.seconds >= seconds);
             while lessons.seconds < seconds {
                 bench.charting.pool.install(|| lessons.give(&mut surrogate, &tracer, seconds))?;
             }
             if lessons.steps == before {
-                bench.charting.skip(format_args!("{what}, {seconds} s of training"), "no optimizer step ended in time");
+                bench.charting.skip(
+                    format_args!("{what}, {seconds} s of training"),
+                    if is_late { "the training before it took longer" } else { "no optimizer step ended in time" },
+                );
                 continue;
             }
             let frozen = surrogate.freeze().map_err(failed)?;

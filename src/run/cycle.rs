@@ -7,7 +7,7 @@
 use super::budget::FrameCost;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
-use super::decision::{Decision, enter_colours, suited_network, why_steps};
+use super::decision::{Decision, NETWORK_SIZES, enter_colours, suited_network, why_steps};
 use super::integration::integration_warnings;
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
@@ -550,6 +550,7 @@ impl<'a> Run<'a> {
         }
         if !render.method.has_surrogate() {
             Decision::withdraw(&mut report.decisions, &["surrogate.table_nodes"]);
+            Decision::withdraw(&mut report.decisions, &NETWORK_SIZES);
         }
         let progress = RunProgress::default();
         Ok(Self {

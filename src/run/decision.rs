@@ -73,22 +73,29 @@ pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
     }
 }
 
+/// Settings that [`suited_network`] chooses.
+pub(super) const NETWORK_SIZES: [&str; 5] =
+    ["network.levels", "network.growth", "network.base_resolution", "network.log2_table", "network.batch"];
+
 /// The network with sizes that suit a window of `shape` nodes where they are open, and enters these choices.
 pub(super) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisions: &mut Vec<Decision>) -> NetworkSettings {
     let suited = given.suited_to(shape);
-    if suited != *given {
-        let longest = shape.into_iter().max().unwrap_or(1);
-        let chosen = [
-            ("network.levels", given.levels.is_none(), suited.levels().to_string()),
-            ("network.growth", given.growth.is_none(), suited.growth().to_string()),
-            ("network.base_resolution", given.base_resolution.is_none(), suited.base_resolution().to_string()),
-            ("network.log2_table", given.log2_table.is_none(), suited.log2_table().to_string()),
-            ("network.batch", given.batch.is_none(), suited.batch().to_string()),
-        ];
-        for (setting, _, value) in chosen.into_iter().filter(|(_, is_open, _)| *is_open) {
-            let why = format!("a GPU trains on a window of {longest} nodes: few levels, of which the finest has two thirds as many cells");
-            Decision::new(setting, value, why).enter(decisions);
-        }
+    let longest = shape.into_iter().max().unwrap_or(1);
+    let few = "few fine levels, which a GPU learns soonest".to_owned();
+    let finest = format!("so that the finest level has two thirds as many cells as the longest axis has nodes, {longest}");
+    let chosen = [
+        (given.levels == suited.levels, suited.levels().to_string(), few.clone()),
+        (given.growth == suited.growth, suited.growth().to_string(), few),
+        (given.base_resolution == suited.base_resolution, suited.base_resolution().to_string(), finest),
+        (
+            given.log2_table == suited.log2_table,
+            suited.log2_table().to_string(),
+            "holds the nodes of the finest level, up to 2^24".to_owned(),
+        ),
+        (given.batch == suited.batch, suited.batch().to_string(), "large batches keep a GPU busy".to_owned()),
+    ];
+    for (setting, (_, value, why)) in NETWORK_SIZES.into_iter().zip(chosen).filter(|(_, (is_given, ..))| !is_given) {
+        Decision::new(setting, value, why).enter(decisions);
     }
     suited
 }

@@ -5,7 +5,7 @@
 //! window has changed.
 
 use super::cycle::{Cycle, Run, Sink};
-use super::decision::Decision;
+use super::decision::{Decision, NETWORK_SIZES};
 use super::slides::{Slide, Slides};
 use super::steering::drawn_by;
 use super::stop::{RunEnd, check_stop};
@@ -274,6 +274,7 @@ impl<B: Backend> Cycle<'_, B> {
             with!(&mut self.session, on => on.surrogate = None);
             run.learning.resize = None;
             Decision::withdraw(&mut run.report.decisions, &["surrogate.table_nodes"]);
+            Decision::withdraw(&mut run.report.decisions, &NETWORK_SIZES);
         } else if !has_surrogate {
             // Its residuals are those of windows before `reference` drew.
             run.learning.trust.reset();

@@ -15,7 +15,7 @@ const TERMS = {
   ramp: "Optical ramp: how the FTLE becomes opacity, from 0 at its lower to 1 at its upper end.",
   extinction: "Extinction: how much light is lost on a unit of length where the FTLE is at the upper end of the colours; more makes the structures more opaque.",
   majorant: "Majorant: upper bound of the opacity, by which samples along a ray are drawn. Where the opacity exceeded it, the picture is too transparent.",
-  budget: "Budget: milliseconds for a frame; fewer make it faster and noisier. Only the method two_level has one.",
+  budget: "Budget: milliseconds for the picture of a frame; fewer make it faster and noisier. Only the method two_level has one.",
   psnr: "PSNR: how close the picture is to the exact one, over its lit pixels, in decibels. 40 dB is an error of 1 % of full brightness (root mean square), 20 dB 10 %.",
   trusted: "Trusted: part of the domain in which the surrogate's measured error is within the tolerance.",
   surrogate: "Surrogate: a table or neural network that predicts what tracing would give.",

@@ -159,25 +159,33 @@ impl NetworkSettings {
         self.batch.unwrap_or(1 << 14)
     }
 
-    /// With sizes for training on a GPU over a window of `shape` nodes along x, y, z, where they are not given. A few fine levels learn a large
-    /// window soonest: the finest has two thirds as many cells as the window has nodes along its longest axis, and the table holds its nodes.
-    /// Found by trials on 600x192x192 nodes. Windows of two dimensions or with fewer than 96 nodes along the longest axis keep the defaults.
+    /// With sizes for training on a GPU over a window of `shape` nodes along x, y, z, where they are open: a batch of 2^18, and, if nothing of the
+    /// hash grid is given, three levels that double nearly, of which the finest has two thirds as many cells as the window has nodes along its
+    /// longest axis, and a table that holds its nodes. A few fine levels learnt 600x192x192 nodes, the only window tried, soonest. Windows of two
+    /// dimensions or with fewer than 96 nodes along the longest axis keep the defaults, as do networks that the CPU trains or whose size is searched.
     #[must_use]
     pub fn suited_to(&self, shape: [usize; 3]) -> Self {
+        const LEVELS: usize = 3;
+        const GROWTH: f32 = 1.8;
         let longest = shape.into_iter().max().unwrap_or(1);
-        if self.encoding != Encoding::HashGrid || !self.inputs.is_empty() || shape.contains(&1) || longest < FEW_NODES {
+        let is_plain =
+            self.encoding == Encoding::HashGrid && self.inputs.is_empty() && self.size == Size::Fixed && self.jacobian_weight == 0.0;
+        if !is_plain || shape.contains(&1) || longest < FEW_NODES {
             return self.clone();
         }
-        let (levels, growth) = (self.levels.unwrap_or(3), self.growth.unwrap_or(1.8));
+        let suited = Self { batch: self.batch.or(Some(1 << 18)), ..self.clone() };
+        if self.levels.is_some() || self.growth.is_some() || self.base_resolution.is_some() || self.log2_table.is_some() {
+            return suited;
+        }
         let finest = 2.0 / 3.0 * longest as f64;
+        let base = finest / f64::from(GROWTH).powi(LEVELS as i32 - 1);
         let nodes: f64 = shape.iter().map(|&n| 2.0 / 3.0 * n as f64 + 1.0).product();
         Self {
-            levels: Some(levels),
-            growth: Some(growth),
-            base_resolution: self.base_resolution.or(Some((finest / f64::from(growth).powi(levels as i32 - 1)).round().max(1.0) as usize)),
-            log2_table: self.log2_table.or(Some((nodes.log2().ceil() as u32).clamp(4, 24))),
-            batch: self.batch.or(Some(1 << 18)),
-            ..self.clone()
+            levels: Some(LEVELS),
+            growth: Some(GROWTH),
+            base_resolution: Some(base.round().clamp(1.0, 65_536.0) as usize),
+            log2_table: Some((nodes.log2().ceil() as u32).clamp(4, 24)),
+            ..suited
         }
     }
 
@@ -247,14 +255,20 @@ mod tests {
             (network.levels(), network.growth(), network.base_resolution(), network.log2_table(), network.batch())
         };
         assert_eq!(sizes(open.suited_to([600, 192, 192])), (3, 1.8, 123, 23, 1 << 18));
-        let given = NetworkSettings { levels: Some(4), log2_table: Some(19), ..open.clone() };
-        assert_eq!(sizes(given.suited_to([600, 192, 192])), (4, 1.8, 69, 19, 1 << 18));
-        // Two dimensions, a small window, inputs besides the position, and frequencies keep the defaults.
+        let given = NetworkSettings { log2_table: Some(19), ..open.clone() };
+        assert_eq!(
+            sizes(given.suited_to([600, 192, 192])),
+            (6, 1.6, 16, 19, 1 << 18),
+            "a grid of which a part is given keeps the defaults"
+        );
+        // Two dimensions, a small window, inputs besides the position, frequencies, a search, and training on the CPU keep the defaults.
         for (network, shape) in [
             (open.clone(), [600, 192, 1]),
             (open.clone(), [64, 64, 64]),
             (NetworkSettings { inputs: vec![Input::Start], ..open.clone() }, [600, 192, 192]),
             (NetworkSettings { encoding: Encoding::Frequency, ..open.clone() }, [600, 192, 192]),
+            (NetworkSettings { size: Size::Auto, ..open.clone() }, [600, 192, 192]),
+            (NetworkSettings { target: Target::FlowMap, jacobian_weight: 0.1, ..open.clone() }, [600, 192, 192]),
         ] {
             assert_eq!(network.suited_to(shape), network);
         }
