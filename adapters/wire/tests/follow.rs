@@ -483,7 +483,8 @@ fn blocks_that_open_after_the_others_were_found_lose_no_step() {
     let (first, later) = (&columns(9, 3)[..1], &columns(9, 3)[1..]);
     let open = |block: &Description| Producer::open(&folder.0, block.clone(), 4, Policy::Wait(LONG)).unwrap();
     let mut producers: Vec<Producer> = first.iter().map(open).collect();
-    let mut polls = 0;
+    let (mut polls, done) = (0, AtomicBool::new(false));
+    let done = &done;
     std::thread::scope(|scope| {
         // All blocks are open before the first step, and step together, as in any solver.
         let mut start = |_| {
@@ -499,12 +500,17 @@ fn blocks_that_open_after_the_others_were_found_lose_no_step() {
                             together.wait();
                             assert!(!publish(&producer, n).overwrote);
                         }
-                        producer
+                        // Its end would be an event of its own.
+                        let begin = Instant::now();
+                        while !done.load(Ordering::Relaxed) && begin.elapsed() < LONG {
+                            sleep(MILLISECOND);
+                        }
                     });
                 }
             }
         };
         let (whole, given_up) = assemble(&folder, &mut start, &|whole| whole.last() == Some(&11));
+        done.store(true, Ordering::Relaxed);
         assert_eq!((whole, given_up), ((0..12).collect(), Vec::new()));
     });
 }
