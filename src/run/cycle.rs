@@ -7,7 +7,7 @@
 use super::budget::FrameCost;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
-use super::decision::{Decision, NETWORK_SIZES, enter_colours, suited_network, why_steps};
+use super::decision::{Decision, enter_colours, suited_network, why_steps};
 use super::integration::integration_warnings;
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
@@ -549,8 +549,7 @@ impl<'a> Run<'a> {
             options.steering.iter().for_each(|steering| steering.keep_method(race.method));
         }
         if !render.method.has_surrogate() {
-            Decision::withdraw(&mut report.decisions, &["surrogate.table_nodes"]);
-            Decision::withdraw(&mut report.decisions, &NETWORK_SIZES);
+            Decision::withdraw_surrogate(&mut report.decisions);
         }
         let progress = RunProgress::default();
         Ok(Self {

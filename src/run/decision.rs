@@ -35,6 +35,12 @@ impl Decision {
     pub(super) fn withdraw(decisions: &mut Vec<Self>, settings: &[&str]) {
         decisions.retain(|decision| !settings.contains(&decision.setting.as_str()));
     }
+
+    /// Removes the decisions about a surrogate, where the method has none.
+    pub(super) fn withdraw_surrogate(decisions: &mut Vec<Self>) {
+        Self::withdraw(decisions, &["surrogate.table_nodes"]);
+        Self::withdraw(decisions, &NETWORK_SIZES);
+    }
 }
 
 impl std::fmt::Display for Decision {
@@ -74,8 +80,7 @@ pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
 }
 
 /// Settings that [`suited_network`] chooses.
-pub(super) const NETWORK_SIZES: [&str; 5] =
-    ["network.levels", "network.growth", "network.base_resolution", "network.log2_table", "network.batch"];
+const NETWORK_SIZES: [&str; 5] = ["network.levels", "network.growth", "network.base_resolution", "network.log2_table", "network.batch"];
 
 /// The network with sizes that suit a window of `shape` nodes where they are open, and enters these choices.
 pub(super) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisions: &mut Vec<Decision>) -> NetworkSettings {

@@ -5,7 +5,7 @@
 //! window has changed.
 
 use super::cycle::{Cycle, Run, Sink};
-use super::decision::{Decision, NETWORK_SIZES};
+use super::decision::Decision;
 use super::slides::{Slide, Slides};
 use super::steering::drawn_by;
 use super::stop::{RunEnd, check_stop};
@@ -273,8 +273,7 @@ impl<B: Backend> Cycle<'_, B> {
         if !run.keeps_surrogate() {
             with!(&mut self.session, on => on.surrogate = None);
             run.learning.resize = None;
-            Decision::withdraw(&mut run.report.decisions, &["surrogate.table_nodes"]);
-            Decision::withdraw(&mut run.report.decisions, &NETWORK_SIZES);
+            Decision::withdraw_surrogate(&mut run.report.decisions);
         } else if !has_surrogate {
             // Its residuals are those of windows before `reference` drew.
             run.learning.trust.reset();
