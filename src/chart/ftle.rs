@@ -186,7 +186,7 @@ impl Opened {
 
     /// Uniform random points in unit and in domain coordinates; in two dimensions all lie in the middle of the slab.
     pub(super) fn random_points(&self, count: usize) -> (Vec<UnitPoint>, Vec<DomainPoint>) {
-        let Points { unit, domain } = Points::random(self, 0..count as u32, 5);
+        let Points { unit, domain } = Points::random(self, count, 5);
         (unit, domain)
     }
 
@@ -203,8 +203,12 @@ pub(super) struct Points {
 }
 
 impl Points {
-    /// Uniform random points; in two dimensions all lie in the middle of the slab.
-    pub(super) fn random(opened: &Opened, numbers: Range<u32>, stream: u32) -> Self {
+    /// The first uniform random points of a stream; in two dimensions all lie in the middle of the slab.
+    pub(super) fn random(opened: &Opened, count: usize, stream: u32) -> Self {
+        Self::numbered(opened, 0..count as u32, stream)
+    }
+
+    fn numbered(opened: &Opened, numbers: Range<u32>, stream: u32) -> Self {
         let (seed, domain) = (opened.plan.scene.seed, &opened.plan.domain);
         let unit: Vec<UnitPoint> = numbers
             .map(|i| {
@@ -338,7 +342,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let ramp = ramp(opened, &known);
     let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
     let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
-    let timed = Points::random(opened, 0..MAX_BATCH[usize::from(charting.device.is_gpu())] as u32, 1);
+    let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
     let mut bench =
         Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, nodes_per_second: None, found: Vec::new() };
     let steps = chosen_steps.or(match opened.plan.map.steps {
@@ -405,11 +409,11 @@ fn ramp(opened: &Opened, ftle: &[f64]) -> f64 {
 /// Points and their true FTLE: as many as the truth integrates in `seconds`. NaN at points without a velocity.
 fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64>) {
     let mut traced = Traced::default();
-    let probe = Points::random(opened, 0..MIN_POINTS as u32, 2);
+    let probe = Points::random(opened, MIN_POINTS, 2);
     let began = Instant::now();
     tracer.trace(&probe.domain, Extras::default(), &mut traced);
     let affordable = seconds * MIN_POINTS as f64 / began.elapsed().as_secs_f64();
-    let points = Points::random(opened, 0..(affordable as usize).clamp(MIN_POINTS, MAX_POINTS) as u32, 0);
+    let points = Points::random(opened, (affordable as usize).clamp(MIN_POINTS, MAX_POINTS), 0);
     tracer.trace(&points.domain, Extras::default(), &mut traced);
     let ftle = |(s, seed): (&f64, &DomainPoint)| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
     let truth = traced.log_stretch_f64.iter().zip(&points.domain).map(ftle).collect();
@@ -644,7 +648,7 @@ impl<'a> Lessons<'a> {
         let scene = &self.opened.plan.scene;
         if !surrogate.trace_labels(tracer, scene.seed, self.drawn, self.fresh).map_err(failed)? {
             let numbers = self.drawn as u32..self.drawn as u32 + self.fresh as u32;
-            let points = Points::random(self.opened, numbers, STREAM);
+            let points = Points::numbered(self.opened, numbers, STREAM);
             self.buffer.push(&audit::trace(tracer, &points.unit, scene.network.label_extras()).map_err(failed)?.samples);
         }
         self.drawn += self.fresh as u64;

@@ -110,14 +110,12 @@ impl Training<'_> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         let extras = settings.network.label_extras();
         let began = Instant::now();
-        let labels = crate::backend::audit::trace(&tracer, &Points::random(opened, 0..options.labels as u32, 6).unit, extras)
+        let labels =
+            crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
+        let label_seconds = began.elapsed().as_secs_f64();
+        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default())
             .map_err(failed)?
             .samples;
-        let label_seconds = began.elapsed().as_secs_f64();
-        let validation =
-            crate::backend::audit::trace(&tracer, &Points::random(opened, 0..options.validation as u32, 7).unit, Extras::default())
-                .map_err(failed)?
-                .samples;
         let request = SurrogateRequest {
             settings: &settings.surrogate,
             network: &settings.network,
