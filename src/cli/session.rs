@@ -435,8 +435,8 @@ pub fn line(record: &FrameRecord) -> String {
             format!("the surrogate saved nothing: {:.1} % of {queries} queries were traced", 100.0 * record.traced_share)
         }
         // All that these trace is traced, whatever drew the picture.
-        "two_level" => format!("drawn by {} and corrected with {} traced points", drawn_by(record), record.traced),
-        "marched" => format!("drawn by {}, uncorrected: {} traced points only measure its error", drawn_by(record), record.traced),
+        "two_level" => format!("drawn by {} and corrected with {} traced points", what_drew(record), record.traced),
+        "marched" => format!("drawn by {}, uncorrected: {} traced points only measure its error", what_drew(record), record.traced),
         _ => format!("traced {:.1} % of {queries} queries", 100.0 * record.traced_share),
     };
     if record.missing > 0 {
@@ -465,7 +465,7 @@ pub fn line(record: &FrameRecord) -> String {
 }
 
 /// What draws the picture of a smooth method.
-fn drawn_by(record: &FrameRecord) -> &'static str {
+fn what_drew(record: &FrameRecord) -> &'static str {
     match record.surrogate.as_deref() {
         Some("table") => "a table",
         Some("network") => "a network",
