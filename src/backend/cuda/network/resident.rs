@@ -120,7 +120,8 @@ pub(in crate::cuda) fn predict_from_host(
     Ok(())
 }
 
-/// Traces uniform random points on the device and adds them to the labels there, as [`crate::Surrogate::trace_labels`] does.
+/// Traces uniform random points on the device and adds them to the labels there, as [`crate::Surrogate::trace_labels`] does. Waits for them, so that
+/// who trains on a clock does not charge them to the training.
 ///
 /// # Errors
 /// The device fails or lacks memory.
@@ -148,6 +149,7 @@ pub(in crate::cuda) fn trace_labels(
         tracer.device().trace(points.address(), count, &out)?;
         sink.learn_from(points.address(), &out, count)?;
     }
+    gpu.synchronize()?;
     Ok(true)
 }
 
