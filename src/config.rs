@@ -14,7 +14,7 @@ use crate::backend::DeviceSettings;
 use crate::flow::{FlowSettings, Integrator, StepsSetting};
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
-use crate::run::{Settings, TimeSettings, TrainingSettings};
+use crate::run::{MapSettings, Settings, TimeSettings, TrainingSettings};
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
 use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings, is_url};
@@ -73,6 +73,9 @@ pub struct SceneFile {
     pub light: Option<LightSettings>,
     /// Extinction and albedo; `None`: scaled to the FTLE of the first slide.
     pub transfer: Option<TransferSettings>,
+    /// Maps of the slides.
+    #[serde(default)]
+    pub maps: MapSettings,
     /// Output of frames.
     #[serde(default)]
     pub publish: PublishSettings,
@@ -230,7 +233,7 @@ impl SceneFile {
         let gridded = matches!(kind, Archive | Live | Turbulence);
         let adaptive = flow.integrator == Integrator::DormandPrince;
         let (learns, hashed) = (self.surrogate.kind != Kind::Table, network.encoding == Encoding::HashGrid);
-        let rules: [(bool, &'static str, &'static [&'static str]); 19] = [
+        let rules: [(bool, &'static str, &'static [&'static str]); 20] = [
             (*kind == Archive, "only with source.kind = \"archive\"", &["archive"]),
             (self.archive.files.is_empty(), "only without archive.files", &["archive.synthetic"]),
             (*kind == Live, "only with source.kind = \"live\"", &["live"]),
@@ -254,6 +257,7 @@ impl SceneFile {
             (network.target == Target::FlowMap, "only with network.target = \"flow_map\"", &["network.jacobian_weight"]),
             (learns, LEARNS, &["training.share", "training.seconds_per_frame", "training.steps_per_frame", "training.resume"]),
             (training.steps_per_frame.is_none(), "only without training.steps_per_frame", &["training.seconds_per_frame"]),
+            (self.publish.maps, "only with publish.maps = true", &["maps"]),
         ];
         rules.into_iter().filter(|(works, ..)| !works).flat_map(|(_, accepted, keys)| keys.iter().map(move |key| (*key, accepted)))
     }
@@ -312,6 +316,7 @@ impl SceneFile {
             camera: scene.camera,
             light: scene.light,
             transfer: scene.transfer,
+            maps: scene.maps,
         }
     }
 

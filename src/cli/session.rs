@@ -10,7 +10,7 @@ use super::{messages, notify};
 use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::dashboard::DashboardSettings;
-use ridgewatch::map::{MapError, SlideMaps, annotated};
+use ridgewatch::map::{Drawn, MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
     DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
     WhenDiskSlow,
@@ -220,7 +220,7 @@ impl Session<'_> {
             steering,
             abandon: stop.abandoned.clone(),
         };
-        let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| !follows && publish.maps);
+        let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| publish.maps);
         let (result, last, summary) = work(setup, &scene, &run_options, output, newest, maps, &stop.requested);
         let report = result?;
         if let (Some(file), Some(found)) = (race, &report.race) {
@@ -240,8 +240,14 @@ impl Session<'_> {
         }
         if !common.json {
             print_text(format_args!("frames in {}", out.join("frames").display()));
-            if summary.files.as_ref().is_some_and(|files| files.maps_written > 0) {
-                print_text(format_args!("a map of each slide in {}", out.join("maps").display()));
+            let maps = summary.files.as_ref().map_or(0, |files| files.maps_written);
+            if maps > 0 {
+                let what = if maps == report.slides {
+                    "a map of each slide".to_owned()
+                } else {
+                    format!("maps of {maps} of {} slides", report.slides)
+                };
+                print_text(format_args!("{what} in {}", out.join("maps").display()));
             }
             summary.movie.iter().for_each(|movie| print_text(movie.line()));
         }
@@ -329,9 +335,13 @@ fn work(
             if let Some(drawing) = maps.as_mut().filter(|_| shown.is_new && !stop.load(Ordering::Relaxed)) {
                 bar.set_message(format!("map of slide {}", shown.slide.index));
                 match drawing.draw(*shown, stop) {
-                    Ok((map, notes)) => {
+                    Ok((drawn, notes)) => {
                         notes.iter().for_each(|text| bar.suspend(|| messages::note(text)));
-                        output.map(map);
+                        match drawn {
+                            Drawn::Map(map) => output.map(map),
+                            Drawn::TooSlow => output.no_map(),
+                            Drawn::TooEarly => {}
+                        }
                     }
                     Err(MapError::Stopped) => {}
                     Err(error) => {

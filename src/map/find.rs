@@ -144,6 +144,10 @@ pub fn find(
         }
         _ => {
             let view = view.map_err(MapError::Usage)?;
+            let mut count = |nodes: usize| {
+                count(nodes);
+                true
+            };
             let field = ridge_field(&view, &mut tracer, [size[0], size[1]], &mut count)?;
             let traced = start.elapsed().as_secs_f64();
             if field.values.iter().all(|v| !v.is_finite()) {

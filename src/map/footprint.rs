@@ -8,9 +8,36 @@ use crate::render::footprint;
 use crate::surrogate::Trace;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::ops::Range;
+use std::time::Instant;
 
 /// Seeds traced at once, which bounds the memory beside the picture.
 const AT_ONCE: usize = 1 << 19;
+/// Seeds of the first part.
+const FIRST: usize = 1 << 13;
+/// Seconds of a part up to which the next one has twice as many seeds.
+const BRIEF: f64 = 0.05;
+
+/// Works through `0..count`, each of which has `seeds` seeds, in parts, until `work` returns false. Parts become larger as long as they take little time,
+/// so that a map can be abandoned soon on any device. Returns whether all was done.
+///
+/// # Errors
+/// Those of `work`.
+pub(super) fn in_parts<E>(count: usize, seeds: usize, mut work: impl FnMut(Range<usize>) -> Result<bool, E>) -> Result<bool, E> {
+    let of_seeds = |most: usize| (most / seeds.max(1)).max(1);
+    let (mut next, mut at_once) = (0, of_seeds(FIRST));
+    while next < count {
+        let (part, begin) = (next..(next + at_once).min(count), Instant::now());
+        next = part.end;
+        if !work(part)? {
+            return Ok(false);
+        }
+        if begin.elapsed().as_secs_f64() < BRIEF {
+            at_once = (2 * at_once).min(of_seeds(AT_ONCE));
+        }
+    }
+    Ok(true)
+}
 
 /// A flow map on the chosen device. If the device fails and its settings allow it, the CPU goes on.
 pub struct MapTracer<'a> {
@@ -152,15 +179,14 @@ impl Raster {
         let count = view.size[0] * view.size[1];
         let mut raster = Self { size: view.size, mean: vec![f32::NAN; count], missing: vec![f32::NAN; count], error: None, failed: 0 };
         let mut variances = Variances::default();
-        let at_once = (AT_ONCE / sampling.seeds).max(1);
-        for first in (0..count).step_by(at_once) {
-            let part = first..(first + at_once).min(count);
+        let is_whole = in_parts(count, sampling.seeds, |part| {
             let seeds: Vec<Vec<(usize, DomainPoint)>> = part.clone().into_par_iter().map(|pixel| seeds_of(view, sampling, pixel)).collect();
             let flat: Vec<DomainPoint> = seeds.iter().flatten().map(|(_, seed)| *seed).collect();
             let values = tracer.ftle(&flat, &mut |_| ())?;
             let flow = tracer.flow();
             let mut next = 0;
-            for (pixel, seeds) in part.clone().zip(&seeds) {
+            let pixels = part.len();
+            for (pixel, seeds) in part.zip(&seeds) {
                 let (mut sum, mut number, mut missing) = ([0.0; 2], [0usize; 2], 0usize);
                 for (half, seed) in seeds {
                     let value = values[next];
@@ -185,12 +211,10 @@ impl Raster {
                     variances.add([sum[0] / number[0] as f64, sum[1] / number[1] as f64]);
                 }
             }
-            if !done(part.len()) {
-                return Ok(None);
-            }
-        }
+            Ok::<_, BackendError>(done(pixels))
+        })?;
         raster.error = variances.error();
-        Ok(Some(raster))
+        Ok(is_whole.then_some(raster))
     }
 
     /// Whether most of a pixel has no velocity.
@@ -205,4 +229,32 @@ fn seeds_of(view: &View, sampling: Sampling, pixel: usize) -> Vec<(usize, Domain
     let half = |half: usize| offsets(sampling, pixel, half).map(move |[u, v]| (half, x + u, y + v));
     let all = half(0).chain(half(1));
     all.filter_map(|(half, x, y)| view.place(x, y).map(|place| (half, view.seed(place)))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_small_at_first_and_hold_everything_once() {
+        for (count, seeds) in [(100_000, 4), (7, 1 << 20), (1, 1), (0, 4)] {
+            let mut parts = Vec::new();
+            let is_whole = in_parts(count, seeds, |part| {
+                parts.push(part);
+                Ok::<_, ()>(true)
+            });
+            assert_eq!(is_whole, Ok(true));
+            assert!(parts.windows(2).all(|pair| pair[0].end == pair[1].start), "{parts:?}");
+            assert_eq!(parts.iter().map(|part| part.len()).sum::<usize>(), count);
+            assert!(parts.iter().all(|part| part.len() == 1 || part.len() * seeds <= AT_ONCE), "{parts:?}");
+            assert!(parts.first().is_none_or(|part| part.start == 0 && (part.len() == 1 || part.len() * seeds <= FIRST)), "{parts:?}");
+        }
+        let mut parts = 0;
+        let is_whole = in_parts(100_000, 4, |_| {
+            parts += 1;
+            Ok::<_, ()>(parts < 3)
+        });
+        assert_eq!((is_whole, parts), (Ok(false), 3));
+        assert_eq!(in_parts(10, 1, |_| Err::<bool, _>("device")), Err("device"));
+    }
 }

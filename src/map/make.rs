@@ -4,7 +4,7 @@ use super::arrows::{Arrows, arrows};
 use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
 use super::contour::contours;
 use super::draw::{MapFigure, Panel};
-use super::footprint::{MapTracer, Raster, RasterError, Sampling};
+use super::footprint::{MapTracer, Raster, RasterError, Sampling, in_parts};
 use super::graticule::axis_unit;
 use super::lines::{RidgeLine, RidgesAbout};
 use super::projection::ProjectionKind;
@@ -117,9 +117,7 @@ pub fn make(
             let Some(raster) = traced_raster else { return Err(MapError::Stopped) };
             let (mut ridges, mut found_by) = (Vec::new(), None);
             if let (Some(strength), Some(size)) = (&options.ridges, nodes) {
-                let field = ridge_field(&view, &mut tracer, size, &mut |seeds| {
-                    count(seeds as u64);
-                })?;
+                let field = ridge_field(&view, &mut tracer, size, &mut |seeds| count(seeds as u64))?;
                 let kind = structures(direction);
                 let found = smoothing::roughness(&field.values, &size);
                 let panel = if panels > 1 { format!("{} FTLE, tau = {tau}: ", direction.name()) } else { String::new() };
@@ -203,25 +201,24 @@ pub(super) fn ridge_nodes(view: &View) -> [usize; 2] {
     [across, across / ratio].map(|n| (n.round() as usize + 1).max(8))
 }
 
-/// The FTLE at nodes from edge to edge of the data.
+/// The FTLE at nodes from edge to edge of the data. Calls `done` with the number of nodes after each part; [`MapError::Stopped`] once that returns false.
 pub(super) fn ridge_field(
     view: &View,
     tracer: &mut MapTracer<'_>,
     size: [usize; 2],
-    done: &mut dyn FnMut(usize),
+    done: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Field, MapError> {
     let [west, south, east, north] = view.region;
     let step = [(east - west) / (size[0] - 1) as f64, (north - south) / (size[1] - 1) as f64];
     let at = |i: usize, j: usize| [west + step[0] * i as f64, south + step[1] * j as f64];
     let mut values = Vec::with_capacity(size[0] * size[1]);
-    // Some rows at once, which bounds the memory.
-    let rows = ((1 << 19) / size[0]).max(1);
-    for first in (0..size[1]).step_by(rows) {
-        let seeds: Vec<_> = (first..(first + rows).min(size[1]))
-            .flat_map(|j| (0..size[0]).map(move |i| (i, j)))
-            .map(|(i, j)| view.seed(at(i, j)))
-            .collect();
-        values.extend(tracer.ftle(&seeds, done).map_err(RunError::of)?);
+    let is_whole = in_parts(size[1], size[0], |rows| {
+        let seeds: Vec<_> = rows.flat_map(|j| (0..size[0]).map(move |i| (i, j))).map(|(i, j)| view.seed(at(i, j))).collect();
+        values.extend(tracer.ftle(&seeds, &mut |_| ()).map_err(RunError::of)?);
+        Ok::<_, RunError>(done(seeds.len()))
+    })?;
+    if !is_whole {
+        return Err(MapError::Stopped);
     }
     let kilometres = (EARTH_RADIUS / 1000.0).to_radians();
     let scale = (0..size[1])

@@ -46,7 +46,7 @@ pub use projection::{Projection, ProjectionKind};
 pub use record::{MapRecord, PanelRecord, RidgeRecord};
 pub use ridges::{Field, RidgePoint, Strength};
 pub use sheet::DrawError;
-pub use slides::SlideMaps;
+pub use slides::{Drawn, SlideMaps};
 pub use strip::annotated;
 pub use surface_files::{SurfacesAbout, SurfacesFormat};
 pub use surfaces::{Surface, SurfacePoint, Surfaces};

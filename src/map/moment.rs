@@ -1,9 +1,10 @@
 //! The moment that a map shows: one seed time, with the velocity that all its integrations need.
 
 use super::MapError;
+use crate::field::Window;
 use crate::flow::{FlowMap, VelocitySource};
 use crate::render::Method;
-use crate::run::{Plan, Settings, Setup, TimeSpan};
+use crate::run::{MapSettings, Plan, Settings, Setup, TimeSpan};
 use crate::source::SourceKind;
 use crate::surrogate::Kind;
 use std::sync::atomic::AtomicBool;
@@ -36,6 +37,8 @@ impl Moment {
         settings.render.samples = settings.render.samples.ceil().max(1.0);
         (settings.surrogate.kind, settings.surrogate.table_nodes, settings.training.resume) = (Kind::Table, None, None);
         (settings.network.inputs, settings.network.start_range) = (Vec::new(), None);
+        // Those of a run.
+        settings.maps = MapSettings::default();
         let mut values = Vec::new();
         for tau in taus {
             let value = tau.value().filter(|value| value.is_finite() && *value > 0.0);
@@ -71,13 +74,9 @@ impl Moment {
         let (mut time, mut date) = (slide.time, slide.date);
         if let VelocitySource::Window(window) = &slide.velocity
             && both
-            && let (Some(oldest), Some(newest)) = (window.oldest(), window.newest())
+            && let Some(seed) = seed_of_both(window, tau)
         {
-            let slack = 1e-9 * tau;
-            let middle = (newest - tau).max(oldest + tau);
-            let inside = |t: &f64| *t >= oldest + tau - slack && *t <= newest - tau + slack;
-            let near = window.snapshots().map(|s| s.time).filter(inside).min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
-            time = near.unwrap_or(middle);
+            time = seed;
             date = slides.date(time);
         }
         let taus = if values.is_empty() { vec![tau] } else { values };
@@ -88,4 +87,14 @@ impl Moment {
     pub fn map(&self, tau: f64) -> FlowMap {
         FlowMap { tau, ..self.plan.map.clone() }
     }
+}
+
+/// Seed time of both directions in a window over twice tau: that of the snapshot nearest to its middle. `None` if the window is empty.
+pub(super) fn seed_of_both(window: &Window, tau: f64) -> Option<f64> {
+    let (oldest, newest) = (window.oldest()?, window.newest()?);
+    let slack = 1e-9 * tau;
+    let middle = (newest - tau).max(oldest + tau);
+    let inside = |t: &f64| *t >= oldest + tau - slack && *t <= newest - tau + slack;
+    let near = window.snapshots().map(|s| s.time).filter(inside).min_by(|a, b| (a - middle).abs().total_cmp(&(b - middle).abs()));
+    Some(near.unwrap_or(middle))
 }

@@ -145,6 +145,11 @@ impl FileWriter {
         self.shared.changed.notify_all();
     }
 
+    /// Counts a map that was not drawn in time.
+    pub(super) fn no_map(&self) {
+        self.shared.lock().statistics.maps_dropped += 1;
+    }
+
     /// Waits for the last frame, a minute at most. Returns the folder, unless the disk hangs, and the counts.
     pub(super) fn finish(mut self) -> (Option<RunFolder>, FileStatistics) {
         let deadline = Instant::now() + self.limit;

@@ -91,6 +91,13 @@ impl Output {
         }
     }
 
+    /// Counts a slide whose map was not drawn in time.
+    pub fn no_map(&self) {
+        if let Some(files) = &self.files {
+            files.no_map();
+        }
+    }
+
     /// Finishes the film and the files (a minute each at most) and the socket (half a second at most), and writes `summary.json` with the caller's values under
     /// `run`. Returns the summary. If it cannot be written, that is a warning.
     pub fn finish(self, run: serde_json::Map<String, serde_json::Value>) -> Summary {

@@ -86,7 +86,7 @@ pub struct PublishSettings {
     pub records_bytes: Option<u64>,
     /// Whether a PNG of each frame is written.
     pub preview: bool,
-    /// Whether a replay of a flow in two dimensions writes a map of each slide.
+    /// Whether a run of a flow in two dimensions writes a map of each slide.
     pub maps: bool,
     /// Frames whose EXR is written.
     pub exr: ExrFrames,

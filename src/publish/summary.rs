@@ -124,7 +124,7 @@ pub struct FileStatistics {
     /// Maps of slides that the disk refused, or had not taken when the run stopped waiting for it.
     #[serde(default)]
     pub maps_failed: u64,
-    /// Maps of slides dropped because the disk was slower than the cycle.
+    /// Maps of slides dropped because the disk, or their drawing beside a simulation, was slower than the cycle.
     #[serde(default)]
     pub maps_dropped: u64,
     /// Bytes of pictures and maps written.

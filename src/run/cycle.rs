@@ -31,6 +31,7 @@ use crate::flow::{
 use crate::progress;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::source::SourceKind;
+use crate::source::live::NextWindow;
 use crate::surrogate::network::{NetworkSettings, Size, Times};
 use crate::surrogate::{
     CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
@@ -94,6 +95,8 @@ pub struct ShownSlide {
     pub asked: FlowMap,
     /// True after the slide's first frame.
     pub is_new: bool,
+    /// The next window of a running simulation; `None` for other sources.
+    pub next: Option<NextWindow>,
 }
 
 /// Summary of a run.
@@ -819,8 +822,8 @@ impl<B: Backend> Cycle<'_, B> {
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
             if number == 0 || commands == Commands::Map {
-                let (map, asked) = (self.map.clone(), self.run.asked.clone());
-                sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map, asked, is_new: number == 0 })));
+                let (map, asked, next) = (self.map.clone(), self.run.asked.clone(), slides.next_window());
+                sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map, asked, is_new: number == 0, next })));
             }
             number += 1;
             since_command = since_command.map(|frames: usize| frames + 1);

@@ -40,7 +40,7 @@ pub use error::RunError;
 pub use race::Race;
 pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;
-pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
+pub use settings::{MapSettings, Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub(crate) use setup::auto_steps;
 pub use setup::{Plan, Setup};
 pub use slides::{Slide, Slides, open_snapshots};

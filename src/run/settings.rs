@@ -47,6 +47,8 @@ pub struct Settings {
     pub light: Option<LightSettings>,
     /// Extinction and albedo; `None`: scaled to the FTLE of the first slide.
     pub transfer: Option<TransferSettings>,
+    /// Maps of the slides.
+    pub maps: MapSettings,
 }
 
 impl Settings {
@@ -79,7 +81,7 @@ impl Settings {
             // Values that are not set, and the unit of extinction, are chosen later and are always accepted.
             Transfer::new(&with_ends(transfer), 1.0)?;
         }
-        Ok(())
+        self.maps.check()
     }
 }
 
@@ -254,6 +256,35 @@ impl TrainingSettings {
             require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
         }
         count("training.replay_buffer", t.replay_buffer, 1024, 1 << 28)
+    }
+}
+
+/// `[maps]`: what the maps of the slides show over their colours, as options of these names of the command `map`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapSettings {
+    /// Ridge lines of the FTLE.
+    pub ridges: bool,
+    /// Arrows of the velocity at the seed time.
+    pub arrows: bool,
+    /// Values that get a line, in the unit of the map.
+    pub contour: Vec<f64>,
+    /// Forward FTLE in red and backward FTLE in blue. Maps of snapshots then begin when twice tau of them are known, and show the time in their middle.
+    pub both: bool,
+}
+
+impl MapSettings {
+    /// Most values that get a line.
+    const MOST_CONTOURS: usize = 64;
+
+    /// Checks ranges.
+    ///
+    /// # Errors
+    /// The values of the lines are too many, or one is not finite.
+    pub fn check(&self) -> Result<(), Refused> {
+        let values = &self.contour;
+        let is_accepted = values.len() <= Self::MOST_CONTOURS && values.iter().all(|value| value.is_finite());
+        require(is_accepted, "maps.contour", values, "a list of at most 64 finite numbers, in the unit of the map")
     }
 }
 

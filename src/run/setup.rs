@@ -5,7 +5,7 @@ use super::default_tau::default_tau;
 use super::race::Race;
 use super::settings::with_ends;
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
-use super::{RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
+use super::{MapSettings, RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Combine, Method, RenderSettings, Renderer, Scene, TransferSettings};
@@ -179,6 +179,9 @@ impl Setup {
             normalisation: scene.flow.normalisation,
             interpolation,
         };
+        // Maps of both directions hold twice tau.
+        let holds_both = scene.maps.both && flat;
+        let held = |tau: f64| if holds_both { 2.0 * tau } else { tau };
         let domain = match (&closed, &scene.domain, &grid) {
             (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
             (_, _, Some(grid)) => grid.domain(),
@@ -186,6 +189,7 @@ impl Setup {
         };
         let races = settle_method(&mut scene, &domain, &mut decisions)?;
         notes.extend(unused_by_maps(&scene));
+        notes.extend(unused_by_volumes(&scene, &domain));
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
         }
@@ -199,7 +203,7 @@ impl Setup {
         // After the checks that read nothing.
         if let (None, Some(source), Some(grid)) = (&scene.time.tau, &mut snapshots, &grid) {
             let (times, nodes) = (source.times().to_vec(), grid.nodes());
-            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, tau, nodes, followed)).is_ok();
+            let fits = |tau: f64| scene.archive.check_window(window_bytes(&times, held(tau), nodes, followed)).is_ok();
             let (tau, why) = default_tau(&mut **source, &map, fits)?;
             let unit = source.describe().time_unit;
             let words = duration(tau, &unit);
@@ -217,14 +221,22 @@ impl Setup {
             && let (Some(times), Some(grid)) = (&times, &grid)
         {
             // Before the first snapshot is read.
-            scene.archive.check_window(window_bytes(times, tau, grid.nodes(), followed))?;
+            scene.archive.check_window(window_bytes(times, held(tau), grid.nodes(), followed))?;
+        }
+        if let (true, false, Some([first, .., last])) = (holds_both, followed, times.as_deref())
+            && last - first < 2.0 * tau * (1.0 - 1e-9)
+        {
+            notes.push("maps.both: no slide gets a map, since the snapshots span less than twice tau".to_owned());
         }
         let slides = match live {
-            Some(live) => live_slides(&scene, live.follow(tau, scene.time.snapshots_per_slide)?, direction),
+            Some(live) => {
+                let window = live.follow_beside(tau, scene.time.snapshots_per_slide, u64::from(holds_both))?;
+                live_slides(&scene, window, direction)
+            }
             None => open_slides(&scene, snapshots, tau, direction)?,
         };
         if let (Some(times), Some(grid)) = (&times, &grid) {
-            notes.extend(memory::short(window_bytes(times, tau, grid.nodes(), followed), ridgewatch_base::memory::available()));
+            notes.extend(memory::short(window_bytes(times, held(tau), grid.nodes(), followed), ridgewatch_base::memory::available()));
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
@@ -291,6 +303,12 @@ fn unused_by_maps(scene: &Settings) -> Option<String> {
     keys.extend((render.tone_map != default.tone_map).then_some("render.tone_map"));
     keys.extend((render.majorant_cells != default.majorant_cells).then_some("render.majorant_cells"));
     (!keys.is_empty()).then(|| format!("without effect on a map: {}", keys.join(", ")))
+}
+
+/// What is said of maps of the slides that a flow in three dimensions has not.
+fn unused_by_volumes(scene: &Settings, domain: &Domain) -> Option<String> {
+    let is_idle = domain.dimensions == 3 && scene.maps != MapSettings::default();
+    is_idle.then(|| "without effect on a flow of three dimensions: maps".to_owned())
 }
 
 /// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.

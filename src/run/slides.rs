@@ -7,7 +7,7 @@ use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
 use crate::progress::{self, Work};
 use crate::setting::{Refused, shown};
-use crate::source::live::{LiveRecord, LiveWindow};
+use crate::source::live::{LiveRecord, LiveWindow, NextWindow};
 use crate::source::{
     Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, follow,
     read_ahead,
@@ -59,6 +59,11 @@ pub trait Slides: Send {
 
     /// For a running simulation and an archive that is followed, true until the next window is complete. `None` for other sources.
     fn is_awaited(&self) -> Option<bool> {
+        None
+    }
+
+    /// The next window of a running simulation; `None` for other sources.
+    fn next_window(&self) -> Option<NextWindow> {
         None
     }
 
@@ -317,6 +322,10 @@ impl Slides for LiveSlides {
 
     fn is_awaited(&self) -> Option<bool> {
         Some(self.window.is_waited_for())
+    }
+
+    fn next_window(&self) -> Option<NextWindow> {
+        Some(self.window.next_window())
     }
 
     fn warnings(&mut self) -> Vec<String> {

@@ -461,7 +461,7 @@ fn who_asks_between_two_slides_gets_the_next_one() {
     assert!(matches!(index(None), Err(NoField::Missing(_))));
     let mut next = || {
         let slide = setup.slides.next_slide(&AtomicBool::new(false)).unwrap().unwrap();
-        let shown = ShownSlide { slide, map: setup.plan.map.clone(), asked: setup.plan.map.clone(), is_new: true };
+        let shown = ShownSlide { slide, map: setup.plan.map.clone(), asked: setup.plan.map.clone(), is_new: true, next: None };
         newest.put(&shown);
         shown
     };

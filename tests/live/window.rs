@@ -155,9 +155,13 @@ fn too_little_memory_is_refused_in_words() {
     let folder = Folder::new("small");
     let _solver = producer(&folder, plane(256));
     let settings = LiveSettings { memory_gib: 0.005, ..settings(&folder) };
-    let live = Live::connect(&settings, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
-    let error = live.follow(1.0, 1).err().unwrap();
-    assert!(error.to_string().contains("live.memory_gib") && error.to_string().contains("three snapshots"), "{error}");
+    let connect = || Live::connect(&settings, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
+    let error = connect().follow(1.0, 1).err().unwrap();
+    assert!(error.to_string().contains("live.memory_gib") && error.to_string().contains("three snapshots, twice"), "{error}");
+    // A third window for maps of both directions.
+    let beside = connect().follow_beside(1.0, 1, 1).err().unwrap().to_string();
+    let least = |text: &str| text.split("at least ").nth(1).unwrap().split(':').next().unwrap().parse::<f64>().unwrap();
+    assert!(beside.contains("three snapshots, 3 times") && least(&beside) > least(&error.to_string()), "{beside}");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Maps that a replay leaves of its slides.
+//! Maps that a run leaves of its slides.
 
 use super::command::ocean;
 use crate::kit::program::{config, json, ridgewatch, run, set, summary, text};
@@ -75,4 +75,76 @@ fn maps_of_an_archive_have_land_and_volumes_have_none() {
         &[],
     );
     assert!(!volume.join("maps").exists());
+}
+
+/// Asserts that the map of a slide is the one that `map` draws with these options, bit for bit.
+fn same_as_alone(folder: &Path, there: &Path, arguments: &[&str]) {
+    let alone = folder.join("alone.png");
+    let fixed = ["map", "--device", "cpu", "--width", "96", "--seeds", "4", "--set", "flow.steps=40", "--out", text(&alone)];
+    run(&mut ridgewatch([&fixed[..], arguments].concat())).success();
+    assert_eq!(json(&alone.with_extension("json")), json(&there.with_extension("json")), "{there:?}");
+    assert!(std::fs::read(&alone).unwrap() == std::fs::read(there).unwrap(), "{there:?}: another picture than that of `map`");
+}
+
+#[test]
+fn what_a_map_shows_over_its_colours_is_that_of_the_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let gyre = config("double_gyre.toml");
+    let sizes = set(&["time.tau=5", "time.slides=1", "render.width=96", "render.height=48"]);
+    let cases: [(&str, &[&str], &[&str]); 3] = [
+        ("lines", &["maps.ridges=true", "maps.contour=[0.2, 0.3]"], &["--ridges", "--contour", "0.2,0.3"]),
+        ("arrows", &["maps.arrows=true"], &["--arrows"]),
+        ("all", &["maps.ridges=true", "maps.arrows=true", "maps.both=true"], &["--ridges", "--arrows", "--both"]),
+    ];
+    let mut pictures = Vec::new();
+    for (name, keys, options) in cases {
+        let out = folder.path().join(name);
+        replay(&gyre, &out, &[&["time.tau=5", "time.slides=1"], keys].concat(), &[]);
+        let there = out.join("maps/slide_000000.png");
+        same_as_alone(folder.path(), &there, &[&[&gyre[..]], &sizes[..], options].concat());
+        pictures.push(std::fs::read(&there).unwrap());
+    }
+    assert!(pictures[0] != pictures[1] && pictures[1] != pictures[2]);
+    let record = json(&folder.path().join("all/maps/slide_000000.json"));
+    assert_eq!(record["panels"].as_array().unwrap().len(), 2);
+    assert!(record["fastest"].as_f64().unwrap() > 0.0 && record["panels"][0]["ridge_lines"].as_u64().unwrap() > 0, "{record}");
+}
+
+#[test]
+fn both_directions_of_an_archive_begin_when_twice_tau_is_known() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = ocean(folder.path());
+    let out = folder.path().join("ocean");
+    let said = replay(text(&data), &out, &["time.tau=\"1 day\"", "time.slides=4", "maps.both=true"], &[]);
+    let maps = out.join("maps");
+    assert_eq!(names(&maps), ["slide_000002.json", "slide_000002.png", "slide_000003.json", "slide_000003.png"]);
+    assert!(said.contains("maps of 2 of 4 slides in"), "{said}");
+    assert_eq!(summary(&out)["files"]["maps_dropped"], 0, "none was too slow");
+    // Slide 2 ends two days after the first snapshot: the map shows the time in the middle of them.
+    let first = maps.join("slide_000002.png");
+    assert_eq!(json(&first.with_extension("json"))["date"], "2002-01-02T00:00:00Z");
+    same_as_alone(folder.path(), &first, &[text(&data), "--tau", "1 day", "--both"]);
+    // Of nine snapshots over four days, none has three days on both sides.
+    let long = folder.path().join("long");
+    let arguments = ["replay", text(&data), "--device", "cpu", "--out", text(&long)];
+    let keys = set(&["time.tau=\"3 days\"", "maps.both=true", "render.width=32", "render.height=16", "flow.steps=10"]);
+    let outcome = run(&mut ridgewatch([&arguments[..], &keys].concat())).success();
+    assert!(outcome.stderr.contains("the snapshots span less than twice tau"), "{}", outcome.stderr);
+    assert!(!long.join("maps").exists());
+}
+
+#[test]
+fn keys_of_maps_that_do_nothing_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, gyre) = (folder.path().join("run"), config("double_gyre.toml"));
+    let replay = |keys: &[&str]| run(&mut ridgewatch([&["replay", &gyre, "--out", text(&out)][..], &set(keys)].concat()));
+    replay(&["publish.maps=false", "maps.ridges=true"]).refused(2, &["`maps.ridges`", "only with publish.maps = true"]);
+    replay(&["maps.contour=[1, inf]"]).refused(2, &["`maps.contour`", "finite numbers"]);
+    replay(&["maps.ridge=true"]).refused(2, &["ridge"]);
+    assert!(!out.exists());
+    let keys =
+        ["maps.arrows=true", "time.tau=1", "time.slides=1", "render.width=16", "render.height=8", "surrogate.table_nodes=[16,16,16]"];
+    let volume = run(&mut ridgewatch([&["replay", &config("abc.toml"), "--device", "cpu", "--out", text(&out)][..], &set(&keys)].concat()))
+        .success();
+    assert!(volume.stderr.contains("without effect on a flow of three dimensions: maps"), "{}", volume.stderr);
 }

@@ -14,4 +14,4 @@ mod window;
 pub use link::ring_of;
 pub use settings::{AtEnd, Follow, LiveSettings};
 pub use simulation::Live;
-pub use window::{LiveRecord, LiveWindow, Taken};
+pub use window::{LiveRecord, LiveWindow, NextWindow, Taken};

@@ -166,6 +166,20 @@ impl Shared {
     }
 }
 
+/// The next window of a simulation, for those who work beside the one that was taken.
+#[derive(Clone)]
+pub struct NextWindow {
+    shared: Arc<Shared>,
+    stride: usize,
+}
+
+impl NextWindow {
+    /// Whether it is complete, so that [`LiveWindow::next_within`] would not wait. False once no more steps come.
+    pub fn is_complete(&self) -> bool {
+        self.shared.lock().due(self.stride)
+    }
+}
+
 /// A window that fills while frames are made. Dropping it ends its thread.
 pub struct LiveWindow {
     shared: Arc<Shared>,
@@ -179,16 +193,26 @@ impl Live {
     /// # Errors
     /// Too little memory for three snapshots; the thread cannot be started.
     pub fn follow(self, tau: f64, stride: usize) -> Result<LiveWindow, SourceError> {
+        self.follow_beside(tau, stride, 0)
+    }
+
+    /// The same, and leaves memory for so many windows that others hold besides that of the current frame.
+    ///
+    /// # Errors
+    /// As for [`Live::follow`].
+    pub fn follow_beside(self, tau: f64, stride: usize, others: u64) -> Result<LiveWindow, SourceError> {
         let live = self;
         let nodes = live.grid.nodes() as u64;
         let (snapshot, step) = (16 * nodes, 4 * nodes * live.description.components() as u64);
         // Waiting steps, the step being read, and the buffers of the link: a restarted simulation may have blocks.
         let steps = (MAX_PENDING as u64 + 1 + live.link.steps_held()) * step;
         // The window, and the window of the current frame.
-        let room = live.settings.memory_bytes().saturating_sub(steps + EXTRA_SNAPSHOTS * snapshot) / (2 * snapshot.max(1));
+        let windows = 2 + others;
+        let room = live.settings.memory_bytes().saturating_sub(steps + EXTRA_SNAPSHOTS * snapshot) / (windows * snapshot.max(1));
         if room < 3 {
-            let least = (steps + (EXTRA_SNAPSHOTS + 6) * snapshot) as f64 / f64::from(1 << 30);
-            let accepted = format!("at least {least:.3}: three snapshots, twice, and the data on the way to them");
+            let least = (steps + (EXTRA_SNAPSHOTS + 3 * windows) * snapshot) as f64 / f64::from(1 << 30);
+            let times = if others == 0 { "twice".to_owned() } else { format!("{windows} times") };
+            let accepted = format!("at least {least:.3}: three snapshots, {times}, and the data on the way to them");
             return Err(SourceError::setting("live.memory_gib", live.settings.memory_gib, accepted));
         }
         let room = room as usize;
@@ -273,6 +297,11 @@ impl LiveWindow {
     pub fn is_waited_for(&self) -> bool {
         let state = self.shared.lock();
         !state.due(self.stride) && !state.ended && self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
+
+    /// Tells whether the next window is complete, also to those who do not hold this one.
+    pub fn next_window(&self) -> NextWindow {
+        NextWindow { shared: Arc::clone(&self.shared), stride: self.stride }
     }
 
     /// Share of tau that the window covers.
