@@ -2,7 +2,7 @@
 
 use super::common::{
     Common, Interrupted, RaceFile, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text,
-    seconds, text_with_tau, verifies_nothing,
+    seconds, text_with_tau, verifies_nothing, word,
 };
 use super::dashboard::{self, Reach};
 use super::signals::Stop;
@@ -12,8 +12,8 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::dashboard::DashboardSettings;
 use ridgewatch::map::{Drawn, MapError, SlideMaps, annotated};
 use ridgewatch::publish::{
-    DEFAULT_ENDPOINT, FileStatistics, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder, Summary,
-    WhenDiskSlow,
+    DEFAULT_ENDPOINT, FileStatistics, Filmed, Movie, MovieSettings, NewestFrame, Output, Peers, PublishError, PublishSettings, RunFolder,
+    Summary, WhenDiskSlow,
 };
 use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup, Steering};
@@ -55,6 +55,9 @@ pub struct RunArguments {
     /// --overwrite is given; `attach` takes the first of NAME, NAME-2, NAME-3 that does not.
     #[arg(long, value_name = "FILE")]
     movie: Option<PathBuf>,
+    /// What the film shows: frames, or maps (those of the slides, with what the table [maps] of the scene draws over them; two dimensions).
+    #[arg(long, value_name = "WHAT", default_value = "frames", value_parser = filmed, requires = "movie")]
+    movie_of: Filmed,
     /// Frames a second of the film, from 1 to 50.
     #[arg(long, value_name = "N", default_value_t = 10.0, requires = "movie")]
     movie_fps: f64,
@@ -98,6 +101,9 @@ impl RunArguments {
         if let Some(endpoint) = &self.publish {
             scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
             scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
+        }
+        if self.movie_of == Filmed::Maps && !scene.publish.maps {
+            bail!(Usage("--movie-of maps: accepted: with publish.maps = true".into()));
         }
         check_learns(scene, "--checkpoint", self.checkpoint.as_deref())?;
         check_learns(scene, "--resume", self.resume.as_deref())?;
@@ -156,11 +162,12 @@ impl Session<'_> {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
-        match verifies_nothing(&setup, options.verify) {
+        for usage in [verifies_nothing(&setup, options.verify), films_nothing(&setup, options.movie_of)].into_iter().flatten() {
+            if !follows {
+                bail!(usage);
+            }
             // The simulation does not come again.
-            Some(usage) if follows => messages::note(usage),
-            Some(usage) => bail!(usage),
-            None => {}
+            messages::note(usage);
         }
         let text = text_with_tau(&scene, &setup, text)?;
         let device = device(common, &scene)?;
@@ -264,6 +271,16 @@ impl Session<'_> {
     }
 }
 
+fn filmed(text: &str) -> Result<Filmed, String> {
+    word(text, "frames, maps")
+}
+
+/// Refuses a film of maps that the flow has not.
+fn films_nothing(setup: &Setup, of: Filmed) -> Option<Usage> {
+    let has_none = of == Filmed::Maps && setup.plan.domain.dimensions == 3;
+    has_none.then(|| Usage("--movie-of maps: the flow has three dimensions, whose slides have no maps; accepted: frames".into()))
+}
+
 /// Starts the film of a run. A run that follows a simulation, which may be started again, takes a name that is free.
 fn film(path: &Path, options: &RunArguments, follows: bool, publish: &PublishSettings) -> Result<Movie> {
     let mut name = path.to_owned();
@@ -277,6 +294,7 @@ fn film(path: &Path, options: &RunArguments, follows: bool, publish: &PublishSet
         messages::note(format_args!("{} exists: the film is written to {}", path.display(), name.display()));
     }
     let settings = MovieSettings {
+        of: options.movie_of,
         path: name,
         frames_per_second: options.movie_fps,
         annotate: options.annotate,

@@ -30,7 +30,7 @@ pub use export::{Field, FieldExport, FieldFormat, FieldFrame, MapAbout, NewestSl
 pub use exr::{channels_at, decode_exr, encode_exr, exr_claims, read_exr, write_exr};
 pub use histogram::{Histogram, histogram};
 pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
-pub use movie::{Movie, MovieSettings};
+pub use movie::{Filmed, Movie, MovieSettings};
 pub use newest::{NewestFrame, NoFrame};
 pub use output::Output;
 pub use past_run::{PastRun, Picture};

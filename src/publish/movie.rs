@@ -1,4 +1,4 @@
-//! Films of a run: GIF, and MP4 through `ffmpeg`. A thread encodes; a film that fails costs the run nothing but the film.
+//! Films of a run, of its frames or of its maps: GIF, and MP4 through `ffmpeg`. A thread encodes; a film that fails costs the run nothing but the film.
 
 mod gif;
 mod mp4;
@@ -9,6 +9,8 @@ use super::summary::MovieStatistics;
 use crate::folder::Folder;
 use crate::run::Frame;
 use crate::setting::{Refused, require};
+use image::ImageFormat;
+use serde::Deserialize;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -17,21 +19,33 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Builder;
 use std::time::{Duration, Instant};
 
-/// Maximum number of frames that wait for the encoder.
+/// Maximum number of pictures that wait for the encoder.
 const QUEUED: usize = 4;
 /// Longest wait of a run for a place in the queue, and at its end for the last frame.
 const LIMIT: Duration = Duration::from_secs(60);
 /// Pause between two attempts to queue a frame.
 const PAUSE: Duration = Duration::from_millis(5);
 
+/// What a film shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Filmed {
+    /// The frames.
+    Frames,
+    /// The maps of the slides.
+    Maps,
+}
+
 /// How a film is made.
 #[derive(Debug, Clone)]
 pub struct MovieSettings {
+    /// What it shows.
+    pub of: Filmed,
     /// The file, `.gif` or `.mp4`.
     pub path: PathBuf,
     /// Frames a second, 1 to 50 (a GIF counts hundredths of a second, and viewers slow those below two down).
     pub frames_per_second: f64,
-    /// Writes time and stated error into the pictures.
+    /// Writes time and stated error into frames. Maps have them.
     pub annotate: bool,
     /// Whether the run waits for a slow encoder, a minute at most, before frames are left out.
     pub waits: bool,
@@ -61,11 +75,20 @@ fn format_of(path: &Path) -> Result<Format, Refused> {
     }
 }
 
+/// A picture of a film.
+#[derive(Debug)]
+enum Shot {
+    Frame(Frame),
+    /// As PNG.
+    Map(Vec<u8>),
+}
+
 /// A film that is being made.
 #[derive(Debug)]
 pub struct Movie {
+    of: Filmed,
     /// `None` once the encoder has failed.
-    queue: Option<SyncSender<Frame>>,
+    queue: Option<SyncSender<Shot>>,
     done: Receiver<()>,
     statistics: Arc<Mutex<MovieStatistics>>,
     waits: bool,
@@ -93,28 +116,41 @@ impl Movie {
         }
         let statistics = MovieStatistics { file: settings.path.display().to_string(), ..MovieStatistics::default() };
         let statistics = Arc::new(Mutex::new(statistics));
-        let (queue, frames) = sync_channel(QUEUED);
+        let (queue, shots) = sync_channel(QUEUED);
         let (tell, done) = channel();
-        let (theirs, waits) = (Arc::clone(&statistics), settings.waits);
+        let (theirs, of, waits) = (Arc::clone(&statistics), settings.of, settings.waits);
         let name = "ridgewatch-movie";
         let work = move || {
-            encode_all(&frames, &settings, format, &theirs);
+            encode_all(&shots, &settings, format, &theirs);
             let _ = tell.send(());
         };
         Builder::new().name(name.into()).spawn(work).map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { queue: Some(queue), done, statistics, waits })
+        Ok(Self { of, queue: Some(queue), done, statistics, waits })
     }
 
-    /// Adds a frame; never fails. Waits for a slow encoder if the settings say so, and else leaves the frame out.
-    pub fn frame(&mut self, mut frame: Frame) {
+    /// Adds a frame to a film of frames; never fails. Waits for a slow encoder if the settings say so, and else leaves the frame out.
+    pub fn frame(&mut self, frame: Frame) {
+        if self.of == Filmed::Frames {
+            self.add(Shot::Frame(frame));
+        }
+    }
+
+    /// Adds the PNG of a map to a film of maps, as [`Self::frame`] does.
+    pub fn map(&mut self, png: &[u8]) {
+        if self.of == Filmed::Maps {
+            self.add(Shot::Map(png.to_vec()));
+        }
+    }
+
+    fn add(&mut self, mut shot: Shot) {
         let Some(queue) = &self.queue else { return locked(&self.statistics).frames_lost += 1 };
         let limit = if self.waits { LIMIT } else { Duration::ZERO };
         let begin = Instant::now();
         loop {
-            match queue.try_send(frame) {
+            match queue.try_send(shot) {
                 Ok(()) => return,
                 Err(TrySendError::Full(back)) if begin.elapsed() < limit => {
-                    frame = back;
+                    shot = back;
                     std::thread::sleep(PAUSE);
                 }
                 Err(TrySendError::Full(_)) => {
@@ -162,18 +198,11 @@ fn folder_of(path: &Path) -> &Path {
 }
 
 /// Encodes until the queue is closed. After an error the frames that follow are lost, and counted by the queue's other end.
-fn encode_all(frames: &Receiver<Frame>, settings: &MovieSettings, format: Format, statistics: &Mutex<MovieStatistics>) {
+fn encode_all(shots: &Receiver<Shot>, settings: &MovieSettings, format: Format, statistics: &Mutex<MovieStatistics>) {
     let outcome = (|| {
         let mut film: Option<([usize; 2], Box<dyn Encoder>)> = None;
-        for frame in frames {
-            let size = [frame.film.width, frame.film.height];
-            let mut rgb = frame.film.tone_mapped(frame.tone_map);
-            if rgb.is_empty() || rgb.len() != 3 * size[0] * size[1] {
-                return Err(io::Error::other("a frame without pixels"));
-            }
-            if settings.annotate {
-                annotate(&mut rgb, size, &frame.record).map_err(io::Error::other)?;
-            }
+        for shot in shots {
+            let (size, rgb) = pixels(&shot, settings.annotate)?;
             let (known, encoder) = match &mut film {
                 Some(film) => film,
                 None => film.insert((size, begin(settings, format, size)?)),
@@ -191,6 +220,26 @@ fn encode_all(frames: &Receiver<Frame>, settings: &MovieSettings, format: Format
         tracing::warn!("{}: the film ends after {} frames: {error}; the run continues", statistics.file, statistics.frames_written);
         statistics.failed = Some(error.to_string());
     }
+}
+
+/// Width, height and R, G, B of a picture, rows from the top.
+fn pixels(shot: &Shot, annotates: bool) -> io::Result<([usize; 2], Vec<u8>)> {
+    let frame = match shot {
+        Shot::Frame(frame) => frame,
+        Shot::Map(png) => {
+            let picture = image::load_from_memory_with_format(png, ImageFormat::Png).map_err(io::Error::other)?.into_rgb8();
+            return Ok(([picture.width() as usize, picture.height() as usize], picture.into_raw()));
+        }
+    };
+    let size = [frame.film.width, frame.film.height];
+    let mut rgb = frame.film.tone_mapped(frame.tone_map);
+    if rgb.is_empty() || rgb.len() != 3 * size[0] * size[1] {
+        return Err(io::Error::other("a frame without pixels"));
+    }
+    if annotates {
+        annotate(&mut rgb, size, &frame.record).map_err(io::Error::other)?;
+    }
+    Ok((size, rgb))
 }
 
 /// Creates the file, through no link, and its encoder.
@@ -223,7 +272,7 @@ mod tests {
     }
 
     fn settings(path: PathBuf, waits: bool) -> MovieSettings {
-        MovieSettings { path, frames_per_second: 30.0, annotate: false, waits, overwrite: false }
+        MovieSettings { of: Filmed::Frames, path, frames_per_second: 30.0, annotate: false, waits, overwrite: false }
     }
 
     fn decoded(path: &Path) -> Vec<u16> {

@@ -55,7 +55,7 @@ impl Output {
         self.newest = Some(newest);
     }
 
-    /// Starts to make a film of the frames.
+    /// Starts to make a film of the frames or maps.
     pub fn film(&mut self, movie: Movie) {
         self.movie = Some(movie);
     }
@@ -84,8 +84,11 @@ impl Output {
         }
     }
 
-    /// Takes the map of a slide, for the run folder; never fails.
+    /// Takes the map of a slide, for the run folder and a film of maps; never fails.
     pub fn map(&mut self, map: SlideMap) {
+        if let Some(movie) = &mut self.movie {
+            movie.map(&map.png);
+        }
         if let Some(files) = &self.files {
             files.map(map);
         }

@@ -27,7 +27,7 @@ impl Saddle {
         let (files, ring) = (tempfile::tempdir().unwrap(), Ring::new(&format!("maps-{name}")));
         let out = files.path().join("run");
         let attach = ["attach", text(&ring.0), "--tau", "2", "--exit-at-end", "--out", text(&out), "--device", "cpu", "--threads", "2"];
-        let common = set(&["render.width=48", "render.height=32", "flow.steps=16", "live.memory_gib=0.01"]);
+        let common = set(&["render.width=48", "render.height=32", "flow.steps=16", "flow.interpolation=linear", "live.memory_gib=0.01"]);
         let sidecar = start(&mut program::ridgewatch([&attach[..], &common, &set(keys)].concat()));
         until("the folder of the ring", || ring.0.join("followers.lock").exists());
         let solver = Producer::open(&ring.0, grid(&NODES), 8, Policy::Wait(LONG)).unwrap();

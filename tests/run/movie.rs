@@ -81,6 +81,34 @@ fn a_gif_holds_the_pictures_of_the_run() {
 }
 
 #[test]
+fn a_film_of_maps_holds_the_map_of_each_slide() {
+    let folder = tempfile::tempdir().unwrap();
+    let film = ["--out", "run", "--movie", "maps.gif", "--movie-of", "maps", "--movie-fps", "2"];
+    run(&mut replay(folder.path(), &[&film[..], &set(&["maps.ridges=true"])].concat())).success();
+    let (frames, delays) = films(&folder.path().join("maps.gif"));
+    assert_eq!(delays, [50; 3], "one a slide");
+    for (number, frame) in frames.iter().enumerate() {
+        let map = image::open(folder.path().join(format!("run/maps/slide_{number:06}.png"))).unwrap().to_rgb8();
+        assert_eq!(frame.dimensions(), map.dimensions());
+        // Most of the page is white; its colours are those of the map.
+        let spread = |pixel: &[u8; 3]| pixel.iter().max().unwrap() - pixel.iter().min().unwrap();
+        let coloured: Vec<_> = map.pixels().zip(frame.pixels()).filter(|(pixel, _)| spread(&pixel.0) > 60).collect();
+        let off = coloured.iter().flat_map(|(a, b)| (0..3).map(|k| f64::from(a.0[k].abs_diff(b.0[k])))).sum::<f64>();
+        let mean = off / (3 * coloured.len()) as f64;
+        assert!(coloured.len() > 5000 && mean < 16.0, "slide {number}: {mean} over {} pixels", coloured.len());
+    }
+    assert!(frames[0] != frames[1] && frames[1] != frames[2]);
+    let movie = &summary(&folder.path().join("run"))["movie"];
+    assert_eq!((movie["frames_written"].as_u64(), movie["frames_lost"].as_u64(), movie["failed"].is_null()), (Some(3), Some(0), true));
+
+    let film = ["--out", "second", "--movie", "second.gif", "--movie-of", "maps"];
+    run(&mut replay(folder.path(), &[&film[..], &set(&["publish.maps=false"])].concat())).refused(2, &["--movie-of maps", "publish.maps"]);
+    run(&mut in_folder(folder.path(), &[&["replay", &config("abc.toml")][..], &film].concat())).refused(2, &["three dimensions"]);
+    run(&mut replay(folder.path(), &["--out", "second", "--movie-of", "maps"])).refused(2, &["--movie"]);
+    assert!(!folder.path().join("second").exists() && !folder.path().join("second.gif").exists());
+}
+
+#[test]
 fn an_mp4_without_ffmpeg_says_what_is_missing() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = replay(folder.path(), &["--out", "run", "--movie", "film.mp4"]);
