@@ -6,7 +6,7 @@ use super::slides::FirstSlides;
 use super::still::colours_of;
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
-use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};
+use crate::backend::{Backend, Cpu, Device, FrameJob, Interruptible, Rendered, Routing, Surrogate as _, SurrogateRequest};
 use crate::flow::Extras;
 use crate::render::{Film, Renderer, Scene};
 use crate::run::{RunError, Settings};
@@ -110,10 +110,13 @@ impl Training<'_> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         let extras = settings.network.label_extras();
         let began = Instant::now();
+        // In parts, which tell how far they are; the labels are traced whole.
+        let never = AtomicBool::new(false);
+        let in_parts = Interruptible::new(&tracer, &never);
         let labels =
-            crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
+            crate::backend::audit::trace(&in_parts, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
         let label_seconds = began.elapsed().as_secs_f64();
-        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default())
+        let validation = crate::backend::audit::trace(&in_parts, &Points::random(opened, options.validation, 7).unit, Extras::default())
             .map_err(failed)?
             .samples;
         let request = SurrogateRequest {

@@ -3,7 +3,7 @@
 use super::common::{Common, Usage, check_folder, chosen_steps, device, dimensions, located, open, print_json, print_text, scene};
 use super::messages;
 use anyhow::{Result, bail};
-use ridgewatch::backend::{Device, TracedOnce};
+use ridgewatch::backend::{Device, Interruptible, TracedOnce};
 use ridgewatch::field::DomainPoint;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
@@ -11,6 +11,7 @@ use ridgewatch::publish::{FieldExport, FieldFormat, FieldFrame, SeedField, seeds
 use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
 use ridgewatch::source::utc;
+use ridgewatch::surrogate::Trace;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -254,6 +255,7 @@ fn compute(
     let check = truth.as_ref().map(|truth| check(truth, &*tracer, &seeds, &found.ftle)).transpose()?;
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
     if let Some(out) = &options.out {
+        bar.set_message("writing the field");
         let export = match export {
             Some(export) => export,
             None => {
@@ -321,8 +323,9 @@ fn truth(plan: &Plan, slide: &Slide, seeds: &[DomainPoint]) -> Result<(&'static 
 
 fn ftle(map: &FlowMap, slide: &Slide, seeds: &[DomainPoint]) -> Result<Vec<f64>> {
     let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
-    let mut traced = Traced::default();
-    tracer.trace(seeds, Extras::default(), &mut traced);
+    let (mut traced, never) = (Traced::default(), AtomicBool::new(false));
+    // In parts, which tell how far they are.
+    Trace::trace(&Interruptible::new(&tracer, &never), seeds, Extras::default(), &mut traced)?;
     Ok(traced.unrounded().iter().map(|s| s / map.tau).collect())
 }
 

@@ -1,6 +1,7 @@
 //! `ridgewatch inspect`.
 
 use super::common::{Common, Usage, is_config, located, print_json, print_text};
+use super::messages;
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::run::TimeSpan;
@@ -37,8 +38,10 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
             Some(value.ok_or_else(|| Usage(format!("--tau {text}: accepted: a number above 0, or words such as \"30 days\"")))?)
         }
     };
+    let spinner = messages::spinner("opening the files".into());
     let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)
         .map_err(|error| located(&scene, error, SourceError::refused))?;
+    spinner.finish_and_clear();
     if common.json {
         print_json(&inspection)?;
     } else {

@@ -1,6 +1,6 @@
 //! Messages on standard error.
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressState, ProgressStyle};
+use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressState, ProgressStyle};
 use ridgewatch::progress::work;
 use std::io::{IsTerminal, Write, stderr};
 use tracing_subscriber::EnvFilter;
@@ -57,11 +57,15 @@ pub fn note_aside(text: impl std::fmt::Display) {
 pub fn progress(length: Option<u64>) -> ProgressBar {
     let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let (bar, style) = match length {
-        Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} eta {eta} {msg}{work}"),
+        Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} {left}{msg}{work}"),
         None => (ProgressBar::new_spinner(), "{spinner} {pos} {elapsed_precise} {msg}{work}"),
     };
     bar.set_draw_target(target);
-    bar.set_style(with_work(style));
+    let left = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+        // Before the first step it is not known. A text that is not written is not shown.
+        let _ = if state.pos() > 0 { write!(out, "eta {:#} ", HumanDuration(state.eta())) } else { Ok(()) };
+    };
+    bar.set_style(with_work(style).with_key("left", left));
     // Keeps its clock running, on a thread, for which indicatif panics if the system refuses one.
     let has_room = || std::thread::Builder::new().spawn(|| ()).is_ok_and(|thread| thread.join().is_ok());
     if stderr().is_terminal() && has_room() {
@@ -97,8 +101,6 @@ pub fn spinner_within(text: String, seconds: f64) -> ProgressBar {
         // A text that is not written is not shown.
         let _ = write!(out, "at most {:.0} s left", (seconds - state.elapsed().as_secs_f64()).max(0.0));
     };
-    if let Ok(style) = ProgressStyle::with_template("{spinner} {elapsed_precise} {left} {msg}") {
-        bar.set_style(style.with_key("left", left));
-    }
+    bar.set_style(with_work("{spinner} {elapsed_precise} {left} {msg}{work}").with_key("left", left));
     bar
 }

@@ -4,6 +4,7 @@ use super::common::{Common, Usage, dimensions, located, opening, print_json, pri
 use super::{messages, signals};
 use anyhow::{Context, Result, bail};
 use ridgewatch::field::{Axis, Geometry, Grid, Snapshot};
+use ridgewatch::progress::Work;
 use ridgewatch::run::{RunError, open_snapshots};
 use ridgewatch::source::SnapshotSource;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Policy, Producer};
@@ -73,7 +74,9 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     messages::note(format_args!("publishing {} steps of {shape:?} nodes into {}", source.times().len(), ring.display()));
     source.describe().notes.iter().for_each(messages::note);
     let (rate, steps) = (options.rate, options.steps.unwrap_or(source.times().len() as u64));
-    let (steps, overwrote, seconds) = signals::until_stopped(|| (), |stop| play(&mut *source, &producers, rate, steps, stop))?;
+    let bar = messages::progress(Some(steps));
+    let (steps, overwrote, seconds) = signals::until_stopped(|| (), |stop| play(&mut *source, &producers, rate, steps, stop, &bar))?;
+    bar.finish_and_clear();
     if common.json {
         return print_json(&serde_json::json!({ "steps": steps, "overwrote": overwrote, "seconds": seconds }));
     }
@@ -91,6 +94,7 @@ fn play(
     rate: Option<f64>,
     steps: u64,
     stop: &AtomicBool,
+    bar: &indicatif::ProgressBar,
 ) -> Result<(u64, u64, f64)> {
     let times = source.times().to_vec();
     // Time of one pass; the interval between two passes is the last one of the archive.
@@ -98,13 +102,16 @@ fn play(
     let wanted = times.len().min(usize::try_from(steps).unwrap_or(usize::MAX));
     let mut held = Vec::new();
     if wanted.saturating_mul(source.grid().nodes()).saturating_mul(12) <= MAX_HELD_BYTES {
+        let work = Work::begin("reading the archive");
         for index in 0..wanted {
             if stop.load(Ordering::Relaxed) {
                 return Ok((0, 0, 0.0));
             }
             held.push(planes(&source.read(index)?));
+            work.reached(index + 1, wanted);
         }
     }
+    bar.reset_eta();
     let (begin, mut overwrote) = (Instant::now(), 0);
     for step in 0..steps {
         let index = (step % times.len() as u64) as usize;
@@ -135,6 +142,7 @@ fn play(
             // SAFETY: each plane has one value for each node of the grid, which contains the block.
             overwrote += u64::from(unsafe { producer.publish(step, time, &field) }?.overwrote);
         }
+        bar.inc(1);
     }
     Ok((steps, overwrote, begin.elapsed().as_secs_f64()))
 }

@@ -89,19 +89,25 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         bail!(usage);
     }
     let scene_text = text_with_tau(&scene, &setup, scene_text)?;
-    let bar = messages::progress(Some(100));
+    let mut bar = messages::progress(Some(100));
     let mut picture: Option<Frame> = None;
     let (mut whole, mut warnings) = (0, Vec::new());
     let sink = &mut |event: Event| match event {
         Event::Begin { notes, frames } => {
-            bar.set_length(100 * frames.unwrap_or(1));
+            // Without a number of frames, the work in progress tells how many are left.
+            bar = messages::progress(frames.map(|frames| 100 * frames));
             notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text)));
         }
         Event::Note(text) => bar.suspend(|| messages::note(text)),
         Event::Slide(_) => {}
-        Event::Progress(share) => bar.set_position(100 * whole + (share * 100.0) as u64),
+        Event::Progress(share) if bar.length().is_some() => bar.set_position(100 * whole + (share * 100.0) as u64),
+        Event::Progress(_) => {}
         Event::Frame(frame) => {
             whole += 1;
+            if bar.length().is_none() {
+                bar.set_position(whole);
+                bar.set_message("frames");
+            }
             // Including warm-up frames, since some warnings appear once a run.
             warnings.extend(frame.record.warnings.iter().cloned());
             picture = Some(frame);

@@ -376,6 +376,7 @@ fn work(
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
     let result = result.and_then(|result| result.map_err(|error| located(scene, error, RunError::refused)));
     bar.finish_and_clear();
+    let _finishing = messages::spinner("finishing the files".into());
     let mut run = serde_json::Map::new();
     run.insert("title".into(), scene.title.as_str().into());
     run.insert("seed".into(), scene.seed.into());

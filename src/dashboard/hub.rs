@@ -4,6 +4,7 @@ use super::metrics::{Metrics, Server};
 use super::pixels::{Kept, Pixels};
 use super::received::{Received, decode};
 use super::steering::{Answer, Reach, Wheel};
+use crate::progress;
 use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
 use bytes::Bytes;
 use ridgewatch_zmtp::{SubscribeError, Subscriber};
@@ -60,6 +61,8 @@ pub(super) struct Hub {
     /// For commands of the browsers.
     pub wheel: Wheel,
     pub pixels: Pixels,
+    /// The run is in this process.
+    is_beside_run: bool,
     /// SVG of speed against accuracy.
     pub chart: Option<Bytes>,
 }
@@ -135,6 +138,12 @@ enum Status {
     Silent,
 }
 
+impl Status {
+    fn unless_silent(self) -> Self {
+        if self == Self::Silent { Self::Following } else { self }
+    }
+}
+
 /// Message about the publisher.
 #[derive(Debug, Serialize)]
 struct State<'a> {
@@ -142,6 +151,9 @@ struct State<'a> {
     endpoint: &'a str,
     status: Status,
     seconds_since_message: Option<f64>,
+    /// What a run in this process has been at for more than two seconds, in words.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    work: Option<String>,
     clients: usize,
     version: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -163,11 +175,12 @@ struct Head {
 }
 
 impl Hub {
-    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels, chart: Option<Bytes>) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels, chart: Option<Bytes>, is_beside_run: bool) -> Self {
         Self {
             endpoint,
             wheel,
             pixels,
+            is_beside_run,
             chart,
             server: format!("{:?}", std::time::SystemTime::now()),
             picture: watch::Sender::new(None),
@@ -330,11 +343,14 @@ impl Hub {
         let clients = lock(&self.clients).there.len();
         let health = lock(&self.health);
         let silence = health.last_message.map(|last| last.elapsed());
+        let work = if self.is_beside_run { progress::work().map(|words| short(&words)) } else { None };
         let state = State {
             kind: "state",
             endpoint: &self.endpoint,
-            status: health.status(silence),
+            // A run at work is not lost.
+            status: if work.is_some() { health.status(silence).unless_silent() } else { health.status(silence) },
             seconds_since_message: silence.map(|silence| silence.as_secs_f64()),
+            work,
             clients,
             version: env!("CARGO_PKG_VERSION"),
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
@@ -451,7 +467,7 @@ mod tests {
 
     #[test]
     fn those_who_watch_push_out_nobody_who_steers() {
-        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None), None));
+        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None), None, false));
         let steering = hub.enter(true);
         let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
         assert_eq!(left(&hub).len(), MAX_CLIENTS);

@@ -100,7 +100,8 @@ impl Dashboard {
         let address = listener.local_addr()?;
         let access = Access::new(token.clone(), hosts, address)?;
         let (wheel, requests) = Wheel::new(steer);
-        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest), chart.map(Bytes::from)));
+        let is_beside_run = newest.is_some();
+        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest), chart.map(Bytes::from), is_beside_run));
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(2).build()?;
         let listener = {
             let _inside = runtime.enter();

@@ -2,6 +2,7 @@
 
 use super::displacement::displacements;
 use super::{Extras, FlowError, FlowMap, Traced, VelocitySource, assemble::cpu_tracer, steps};
+use ridgewatch_base::progress::Work;
 use ridgewatch_field::{Snapshot, Window};
 use std::sync::Arc;
 
@@ -28,8 +29,10 @@ const POINTS: usize = 2048;
 pub fn time_resolution(window: &Arc<Window>, map: &FlowMap, t0: f64) -> Result<TimeResolution, FlowError> {
     let tracer = cpu_tracer(VelocitySource::Window(window.clone()), map, t0)?;
     let points = steps::quasi_random_points(tracer.domain(), POINTS);
+    let work = Work::begin("measuring the resolution in time");
     let mut all = Traced::default();
     tracer.trace(&points, Extras::default(), &mut all);
+    work.reached(1, 2);
     let finite: Vec<f64> = all.log_stretch.iter().map(|s| f64::from(*s)).filter(|s| s.is_finite()).collect();
     let ftle_rms = (finite.iter().map(|s| s * s).sum::<f64>() / finite.len().max(1) as f64).sqrt() / map.tau;
 

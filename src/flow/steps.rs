@@ -1,6 +1,7 @@
 //! Chooses the number of Runge-Kutta steps by its error: step doubling on quasi-random points (Roberts 2018).
 
 use super::{FlowError, StepChoice, Traced};
+use ridgewatch_base::progress::Work;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 
 /// Smallest number of steps tried on closed forms.
@@ -111,12 +112,18 @@ pub fn choose_steps(
         MAX_STEPS
     };
     let multiple_of = intervals.max(1);
+    let work = Work::begin("choosing the steps of a path");
     let mut last = StepChoice { steps, difference: f64::INFINITY, within_tolerance: false, not_finite: 0, multiple_of };
     while steps <= max_steps {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
         let (difference, not_finite) = trimmed_difference(&once, &twice, gridded);
-        let within_tolerance = difference <= allowed(tolerance, share, &twice);
+        let allowed = allowed(tolerance, share, &twice);
+        let within_tolerance = difference <= allowed;
+        if difference.is_finite() {
+            // How many more are needed is not known.
+            work.stands(format!("with {steps} the log-stretch differs by {difference:.1e}, allowed are {allowed:.1e}"));
+        }
         last = StepChoice { steps, difference, within_tolerance, not_finite, multiple_of };
         if last.within_tolerance {
             return Ok(last);

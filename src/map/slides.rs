@@ -11,7 +11,7 @@ use super::{MapError, Moment};
 use crate::backend::Device;
 use crate::field::Window;
 use crate::flow::{Direction, FlowMap, VelocitySource};
-use crate::progress;
+use crate::progress::Work;
 use crate::publish::SlideMap;
 use crate::run::{Plan, ShownSlide, Slide};
 use crate::source::live::{Follow, NextWindow};
@@ -91,11 +91,12 @@ impl SlideMaps {
             ridge_grid: None,
         };
         let mut attempt = Attempt::begin(next);
-        let mut goes_on = || {
-            progress::mark();
+        let work = Work::begin("drawing the map of the slide");
+        let mut goes_on = |done: u64, all: u64| {
+            work.reached_share(done as f64 / all as f64);
             !stop.load(Ordering::Relaxed) && attempt.may_go_on(&self.pace)
         };
-        let made = if goes_on() { make(&moment, &options, &self.device, &mut |_, _| goes_on()) } else { Err(MapError::Stopped) };
+        let made = if goes_on(0, 1) { make(&moment, &options, &self.device, &mut goes_on) } else { Err(MapError::Stopped) };
         let made = match made {
             Err(MapError::Stopped) if !stop.load(Ordering::Relaxed) => {
                 self.pace.ended(&attempt, false);

@@ -4,6 +4,7 @@ use super::error::PublishError;
 use super::run_folder::{RunFolder, SlideMap};
 use super::settings::{ExrFrames, PublishSettings, WhenDiskSlow};
 use super::summary::FileStatistics;
+use crate::progress::Work;
 use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::sync::mpsc::channel;
@@ -107,6 +108,7 @@ impl FileWriter {
         if self.when_disk_slow == WhenDiskSlow::Drop {
             return state;
         }
+        let _work = (queued(&state) >= MAX_PICTURES).then(|| Work::begin("waiting for the disk"));
         let waited = self.shared.changed.wait_timeout_while(state, self.limit, |state| queued(state) >= MAX_PICTURES);
         waited.unwrap_or_else(PoisonError::into_inner).0
     }
@@ -156,7 +158,10 @@ impl FileWriter {
         let mut state = self.shared.lock();
         state.closed = true;
         self.shared.changed.notify_all();
-        while !state.queue.is_empty() || state.busy.is_some() {
+        let left = |state: &State| state.queue.len() + usize::from(state.busy.is_some());
+        let (work, all) = (Work::begin("writing the last frames"), left(&state));
+        while left(&state) > 0 {
+            work.reached(all.saturating_sub(left(&state)), all);
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 let mut statistics = state.statistics.clone();

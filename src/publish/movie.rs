@@ -7,6 +7,7 @@ use super::annotate::annotate;
 use super::error::PublishError;
 use super::summary::MovieStatistics;
 use crate::folder::Folder;
+use crate::progress::Work;
 use crate::run::Frame;
 use crate::setting::{Refused, require};
 use image::ImageFormat;
@@ -14,7 +15,7 @@ use serde::Deserialize;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::Builder;
 use std::time::{Duration, Instant};
@@ -23,6 +24,8 @@ use std::time::{Duration, Instant};
 const QUEUED: usize = 4;
 /// Longest wait of a run for a place in the queue, and at its end for the last frame.
 const LIMIT: Duration = Duration::from_secs(60);
+/// Interval at which the end of a film is looked for.
+const LOOK: Duration = Duration::from_millis(200);
 /// Pause between two attempts to queue a frame.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -90,6 +93,8 @@ pub struct Movie {
     /// `None` once the encoder has failed.
     queue: Option<SyncSender<Shot>>,
     done: Receiver<()>,
+    /// Frames that were queued.
+    queued: u64,
     statistics: Arc<Mutex<MovieStatistics>>,
     waits: bool,
 }
@@ -125,7 +130,7 @@ impl Movie {
             let _ = tell.send(());
         };
         Builder::new().name(name.into()).spawn(work).map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { of, queue: Some(queue), done, statistics, waits })
+        Ok(Self { of, queue: Some(queue), done, queued: 0, statistics, waits })
     }
 
     /// Adds a frame to a film of frames; never fails. Waits for a slow encoder if the settings say so, and else leaves the frame out.
@@ -145,11 +150,12 @@ impl Movie {
     fn add(&mut self, mut shot: Shot) {
         let Some(queue) = &self.queue else { return locked(&self.statistics).frames_lost += 1 };
         let limit = if self.waits { LIMIT } else { Duration::ZERO };
-        let begin = Instant::now();
+        let (begin, mut work) = (Instant::now(), None);
         loop {
             match queue.try_send(shot) {
-                Ok(()) => return,
+                Ok(()) => return self.queued += 1,
                 Err(TrySendError::Full(back)) if begin.elapsed() < limit => {
+                    work.get_or_insert_with(|| Work::begin("waiting for the encoder of the film"));
                     shot = back;
                     std::thread::sleep(PAUSE);
                 }
@@ -178,7 +184,16 @@ impl Movie {
     /// Completes the film, within a minute, and returns its counts.
     pub fn finish(mut self) -> MovieStatistics {
         self.queue = None;
-        let answered = self.done.recv_timeout(LIMIT).is_ok();
+        let (work, by) = (Work::begin("finishing the film"), Instant::now() + LIMIT);
+        let answered = loop {
+            match self.done.recv_timeout(LOOK) {
+                Err(RecvTimeoutError::Timeout) if Instant::now() < by => {
+                    let left = self.queued.saturating_sub(locked(&self.statistics).frames_written);
+                    work.stands(format!("{left} frames are left"));
+                }
+                answer => break answer.is_ok(),
+            }
+        };
         let mut statistics = locked(&self.statistics).clone();
         if !answered && statistics.failed.is_none() {
             let failed = format!("the encoder did not end within {LIMIT:?}");

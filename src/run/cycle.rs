@@ -9,6 +9,7 @@ use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
 use super::decision::{Decision, enter_colours, suited_network, why_steps};
 use super::integration::integration_warnings;
+use super::prepare::FLOW_MAP;
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
 use super::refine::Frames;
@@ -21,6 +22,7 @@ use super::stop::{RunEnd, check_stop};
 use super::storage::begin_with_half;
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
+use super::until::Refining;
 use super::{ColorBar, RunError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
@@ -28,7 +30,7 @@ use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{
     FlowError, FlowMap, IntegrationDifferences, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution,
 };
-use crate::progress;
+use crate::progress::{self, Work};
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::source::SourceKind;
 use crate::source::live::NextWindow;
@@ -451,7 +453,7 @@ impl Recovering for Beginning<'_> {
 
 /// Prepares the first slide on the backend, or on the CPU if the device fails and the options allow the fallback.
 fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut Beginning<'_>) -> Result<Session<B>, RunEnd> {
-    let pool = beginning.threads.render();
+    let (pool, _work) = (beginning.threads.render(), Work::begin(FLOW_MAP));
     let error = match pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time)) {
         Ok(tracer) => return Ok(Session::Device(On { backend, tracer: Some(tracer), surrogate: None, picture: B::Picture::default() })),
         Err(BackendError::Device(error)) => error,
@@ -750,7 +752,7 @@ impl<B: Backend> Cycle<'_, B> {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let planned = warmups + time.frames_per_slide;
         let (mut number, mut since_command) = (0, None);
-        let mut pace = Pace::default();
+        let (mut pace, mut refining) = (Pace::default(), Refining::default());
         loop {
             // The next window may never come, so this one's next frame tells of a loss.
             slide.warnings.extend(slides.loss());
@@ -766,6 +768,7 @@ impl<B: Backend> Cycle<'_, B> {
             if commands >= Commands::Method && !keeps_picture {
                 with!(&mut self.session, on => on.picture = Default::default());
                 pace.begin_anew();
+                refining = Refining::default();
             }
             // Only pictures that accumulate have a target.
             let target = self.run.render.until;
@@ -818,6 +821,10 @@ impl<B: Backend> Cycle<'_, B> {
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
             pace.add(self.run.render.method, &frame.record);
+            match target.zip(frame.record.picture_error).filter(|_| number >= warmups && !is_done) {
+                Some((target, error)) => refining.tell(self.run.render.method, target, &error, start, most.saturating_sub(number + 1)),
+                None => refining = Refining::default(),
+            }
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
@@ -829,6 +836,7 @@ impl<B: Backend> Cycle<'_, B> {
             since_command = since_command.map(|frames: usize| frames + 1);
             if self.run.is_paused() {
                 if is_done || since_command.is_none_or(|frames| frames >= FRAMES_WHILE_PAUSED) {
+                    refining = Refining::default();
                     while !self.run.is_commanded_within(GLANCE) && !slides.is_lost() {
                         self.run.check_end()?;
                         transaction!(self, slide, run, on => run.checkpoint_if_due(on));
@@ -842,6 +850,7 @@ impl<B: Backend> Cycle<'_, B> {
             if !is_done && !is_due && (number < most || is_new) {
                 continue;
             }
+            refining = Refining::default();
             if let Some(target) = target.filter(|_| !is_done && number <= most) {
                 let why = if is_due { "the next window is complete" } else { "no slide gets more frames" };
                 self.run.progress.warnings.push(format!("slide {}: the stated error is not yet below {target}, but {why}", slide.index));
@@ -893,6 +902,7 @@ impl<B: Backend> Cycle<'_, B> {
         let last_frame = run.progress.frame.checked_sub(1);
         let last = match &mut run.checkpoints {
             Some(checkpoints) => {
+                let _work = Work::begin("writing the checkpoint");
                 let last = with!(&self.session, on => match &on.surrogate {
                     Some(surrogate) => checkpoints.finish(last_frame, surrogate),
                     None => Ok(()),

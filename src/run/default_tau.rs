@@ -4,6 +4,7 @@ use super::RunError;
 use crate::backend::stratified_points;
 use crate::field::{DomainPoint, Snapshot, Window};
 use crate::flow::{Direction, Extras, FlowMap, Normalisation, Steps, Traced, VelocitySource, cpu_tracer};
+use crate::progress::Work;
 use crate::source::SnapshotSource;
 use crate::trust::Strata;
 use std::sync::Arc;
@@ -33,6 +34,7 @@ pub(super) fn default_tau(source: &mut dyn SnapshotSource, map: &FlowMap, fits: 
     let (mut held, mut stride, mut read) = (Vec::<Arc<Snapshot>>::new(), 1, 0);
     let mut last = 2.min(end);
     let mut chosen = None;
+    let work = Work::begin("choosing tau");
     loop {
         while last / stride > MAX_SNAPSHOTS {
             held = held.into_iter().step_by(2).collect();
@@ -45,6 +47,8 @@ pub(super) fn default_tau(source: &mut dyn SnapshotSource, map: &FlowMap, fits: 
             // The run refuses a window that does not fit at all.
             return Ok((chosen.unwrap_or(tau), "longer windows may not be held in memory (archive.memory_gib)".to_owned()));
         }
+        // How long it becomes is not known.
+        work.stands(format!("{last} of at most {end} snapshot intervals"));
         for index in (read..=last).step_by(stride) {
             held.push(Arc::new(source.read(index)?));
             read = index + stride;

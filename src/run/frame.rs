@@ -16,7 +16,7 @@ use crate::backend::{
 };
 use crate::field::Domain;
 use crate::flow::VelocitySource;
-use crate::progress;
+use crate::progress::{self, Work as InProgress};
 use crate::render::smooth::AUDIT_PAIRS;
 use crate::render::{Combine, Method};
 use crate::surrogate::{Learned, Predict, Trace};
@@ -226,10 +226,12 @@ impl Run<'_> {
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
         let (renderer, frame, stop, abandon) = (&mut self.renderer, self.progress.frame, self.stop, &*self.options.abandon);
+        // Before training begins beside it.
+        let mut drawing = Some(InProgress::begin("rendering the frame"));
         let mut render = || -> Result<Work<B::Samples>, DeviceError> {
-            let progress = Mutex::new(&mut *sink);
+            let (progress, drawing) = (Mutex::new(&mut *sink), drawing.take());
             let report = |share: f32| {
-                progress::mark();
+                drawing.iter().for_each(|drawing| drawing.reached_share(f64::from(share)));
                 if let Ok(mut sink) = progress.lock() {
                     (*sink)(Event::Progress(share));
                 }
@@ -248,7 +250,8 @@ impl Run<'_> {
             };
             let rendered = backend.render(&job, renderer, accumulated)?;
             let render_seconds = begin.elapsed().as_secs_f64();
-            let auditing = Instant::now();
+            drop(drawing);
+            let (auditing, _audit) = (Instant::now(), InProgress::begin("measuring the error of the frame"));
             let cells = trust.shape();
             let strata = match frozen {
                 Some(_) => {
@@ -322,7 +325,7 @@ impl Run<'_> {
         else {
             return Ok(());
         };
-        let begin = Instant::now();
+        let (begin, _work) = (Instant::now(), InProgress::begin("training until the next window is complete"));
         let (mut trained, mut was_idle) = (0.0, false);
         while trained < settings.seconds()
             && !slides.is_lost()

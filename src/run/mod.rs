@@ -30,6 +30,7 @@ mod stop;
 mod storage;
 mod training;
 mod transaction;
+mod until;
 
 pub use crate::trust::TrustedError;
 pub use checkpoints::CheckpointTotals;

@@ -10,6 +10,7 @@ use crate::backend::{
 };
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
+use crate::progress::Work;
 use crate::render::Method;
 use crate::surrogate::network::{Input, uniform};
 use crate::surrogate::{Kind, Samples, Trace};
@@ -28,6 +29,8 @@ const SHORTER_STREAM: u64 = 1 << 61;
 const UNIFORM: f64 = 0.05;
 /// Range of the FTLE, as a share of its magnitude, below which it counts as uniform.
 const UNIFORM_SHARE: f64 = 0.01;
+/// Work on a flow map: its steps may be chosen, and a device takes the window, and at first compiles kernels.
+pub(super) const FLOW_MAP: &str = "preparing the flow map";
 /// Picture number of the pilot.
 const PILOT_PICTURE: u64 = 1 << 41;
 
@@ -48,6 +51,7 @@ impl Run<'_> {
         };
         let (On { backend, tracer, surrogate, .. }, begin) = (on, Instant::now());
         let tracer = present(tracer);
+        let _work = Work::begin("building the surrogate");
         let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
         check_stop(self.stop)?;
         *surrogate = Some(built);
@@ -79,6 +83,7 @@ impl Run<'_> {
     /// Uploads the window of a slide and prepares its flow map.
     pub(super) fn next_tracer<B: Backend>(&mut self, on: &mut On<B>, slide: &Slide, map: &FlowMap) -> Result<(), RunEnd> {
         let On { backend, tracer, .. } = on;
+        let _work = Work::begin(FLOW_MAP);
         *tracer = Some(self.threads.render().install(|| backend.tracer(&slide.velocity, map, slide.time))?);
         Ok(())
     }
@@ -87,6 +92,7 @@ impl Run<'_> {
     pub(super) fn slide_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let (On { tracer, surrogate, .. }, begin) = (on, Instant::now());
         if let Some(surrogate) = surrogate {
+            let _work = Work::begin("moving the surrogate to the window");
             let tracer = present(tracer);
             self.threads.render().install(|| surrogate.window_slid(tracer, self.stop))?;
             check_stop(self.stop)?;
@@ -199,6 +205,8 @@ impl Run<'_> {
         let gate = Gate::uniform(false);
         let routing = Routing { gate: &gate, trace_budget: None, keep: self.labels_per_frame(on), extras: self.label_extras() };
         let On { backend, tracer, .. } = &mut *on;
+        let work = Work::begin("rendering a first picture with one sample a pixel");
+        let report = |share: f32| work.reached_share(f64::from(share));
         let job = FrameJob {
             tracer: present(tracer),
             surrogate: None,
@@ -207,7 +215,7 @@ impl Run<'_> {
             samples: 1.0,
             smooth: None,
             is_map: false,
-            progress: None,
+            progress: Some(&report),
             stop: self.stop,
         };
         let mut renderer = self.renderer.clone();

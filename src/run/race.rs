@@ -12,6 +12,7 @@ use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present, with};
 use super::{Event, FrameRecord};
 use crate::backend::{Backend, FrameJob, Rendered, Routing, Surrogate};
+use crate::progress::Work;
 use crate::render::Method;
 use crate::render::smooth::{PictureError, noise_psnr};
 use crate::surrogate::Kind;
@@ -194,8 +195,8 @@ impl Run<'_> {
         scene.render.method.has_surrogate() && (self.render.method.has_surrogate() || !may_go)
     }
 
-    /// Draws pictures by a method that are not shown.
-    fn try_method<B: Backend>(&mut self, on: &mut On<B>, method: Method) -> Result<Pace, RunEnd> {
+    /// Draws pictures by a method that are not shown. `told` gets how many of them are drawn.
+    fn try_method<B: Backend>(&mut self, on: &mut On<B>, method: Method, told: &(dyn Fn(f64) + Sync)) -> Result<Pace, RunEnd> {
         let gate = self.gate(method);
         let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
         let frozen = serves.map(Surrogate::freeze).transpose()?;
@@ -206,6 +207,7 @@ impl Run<'_> {
         let (mut renderer, mut picture) = (self.renderer.clone(), B::Picture::default());
         let (mut pace, mut before) = (Pace::default(), None);
         for number in 0..PICTURES as u64 {
+            let report = |share: f32| told(number as f64 + f64::from(share));
             let job = FrameJob {
                 tracer: present(tracer),
                 surrogate: frozen.as_ref(),
@@ -214,13 +216,14 @@ impl Run<'_> {
                 samples: SAMPLES,
                 smooth,
                 is_map: false,
-                progress: None,
+                progress: Some(&report),
                 stop: self.stop,
             };
             let begin = Instant::now();
             let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer, &mut picture))?;
             let seconds = begin.elapsed().as_secs_f64();
             check_stop(self.stop)?;
+            report(1.0);
             let Rendered { film, error, .. } = rendered;
             // Of a frame with the samples of the run, as the noise falls.
             let more = 10.0 * (self.render.samples / SAMPLES).log10() - OF_TWO;
@@ -247,17 +250,20 @@ impl<B: Backend> Cycle<'_, B> {
         let has_surrogate = with!(&self.session, on => on.surrogate.is_some());
         let tracing = if has_surrogate { 0.0 } else { run.progress.surrogate_seconds };
         // Of `marched` one picture tells all.
-        let pictures = METHODS.len() * PICTURES - 1;
+        let pictures_of = |method| if method == Method::Marched { 1 } else { PICTURES };
+        let pictures: usize = METHODS.into_iter().map(pictures_of).sum();
         let wanted = tracing + pictures as f64 * pace.last;
         let Some(room) = races.allow(wanted).filter(|_| !slides.is_over()) else { return Ok(()) };
         let (begin, count) = (Instant::now(), races.count + 1);
+        let (work, mut drawn) = (Work::begin("racing the methods"), 0);
         let mut seconds = Vec::new();
         for method in METHODS {
             // What a method takes is known afterwards only.
             if begin.elapsed().as_secs_f64() > room {
                 break;
             }
-            match self.time_of(method, pace) {
+            let told = |more: f64| work.reached_share((drawn as f64 + more) / pictures as f64);
+            match self.time_of(method, pace, &told) {
                 Ok(time) => seconds.push((method, time)),
                 Err(RunEnd::Device(error)) => {
                     // What was measured is of another device.
@@ -266,6 +272,7 @@ impl<B: Backend> Cycle<'_, B> {
                 }
                 Err(end) => return Err(end),
             }
+            drawn += pictures_of(method);
         }
         let race = (seconds.len() == METHODS.len()).then(|| Race::of(seconds, slide.index));
         race.iter().for_each(|race| self.take_method(race, sink));
@@ -302,11 +309,11 @@ impl<B: Backend> Cycle<'_, B> {
 
     /// Seconds from a slide to the target by a method, which draws pictures of its own: those of the slide may be single ones, whose first costs most.
     /// `None` if it never reaches it, or the device has no room for it.
-    fn time_of(&mut self, method: Method, drawn: &Pace) -> Result<Option<f64>, RunEnd> {
+    fn time_of(&mut self, method: Method, drawn: &Pace, told: &(dyn Fn(f64) + Sync)) -> Result<Option<f64>, RunEnd> {
         let serves = method.has_surrogate();
         let tried = with!(&mut self.session, on => {
             let built = if serves && on.surrogate.is_none() { self.run.build_surrogate(on) } else { Ok(()) };
-            built.and_then(|()| self.run.try_method(on, method))
+            built.and_then(|()| self.run.try_method(on, method, told))
         });
         match tried {
             Ok(pace) => {

@@ -228,8 +228,10 @@ impl Slides for ArchiveSlides {
                 Err(fault) => warnings.push(fault.to_string()),
             }
             *taken += usize::from(window.newest() != newest);
-            if let (false, Some(work), Some(oldest), Some(newest)) = (window.is_full(), &work, window.oldest(), window.newest()) {
-                work.reached((1e6 * (newest - oldest) / window.span()) as usize, 1_000_000);
+            match (&work, window.oldest(), window.newest()) {
+                (Some(work), Some(oldest), Some(newest)) if !window.is_full() => work.reached_share((newest - oldest) / window.span()),
+                (Some(work), ..) => work.reached(*taken, self.stride),
+                _ => {}
             }
         }
         *taken = 0;
@@ -295,7 +297,14 @@ impl Slides for LiveSlides {
             return Ok(None);
         }
         let start = Instant::now();
-        let Some(taken) = wait_for(stop, |limit| self.window.next_within(limit)) else { return Ok(None) };
+        // Later windows are awaited, and have no time left.
+        let work = (self.count.given == 0).then(|| Work::begin("receiving the window"));
+        let next = |limit| {
+            work.iter().for_each(|work| work.reached_share(self.window.filled()));
+            self.window.next_within(limit)
+        };
+        let Some(taken) = wait_for(stop, next) else { return Ok(None) };
+        drop(work);
         let taken = taken?;
         Ok(Some(Slide {
             index: self.count.next(),

@@ -6,7 +6,7 @@ use super::stop::{RunEnd, check_stop};
 use crate::backend::stratified_points;
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
-use crate::progress;
+use crate::progress::{self, Work};
 use crate::render::Transfer;
 use crate::trust::Strata;
 use std::ops::RangeInclusive;
@@ -72,11 +72,14 @@ pub(super) struct PictureSteps {
 /// As for [`cpu_tracer`], or a stop is requested.
 pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice) -> Result<(PictureSteps, Option<Comparison>), RunEnd> {
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
+    let work = Work::begin("choosing the steps of the picture");
     let Some(mut comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
         return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 }, None));
     };
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
+        // Where it ends is not known.
+        work.stands(format!("{} of at most {} a path", multiple * chosen.multiple_of, chosen.steps));
         let found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
         comparison.of_steps = found.residual;
         if found.residual <= shown.most() {
@@ -102,6 +105,7 @@ pub(super) fn is_outdated(
 ) -> Result<(bool, Option<Comparison>), RunEnd> {
     // A quarter of the points of a choice, and others on each slide.
     let cells = if shown.plan.domain.dimensions == 3 { [8, 8, 8] } else { [32, 16, 1] };
+    let _work = Work::begin("comparing the steps of the picture with more");
     let Some(mut comparison) = Comparison::new(shown, slide, cells, slide.index, 2 * chosen.steps)? else { return Ok((false, None)) };
     // Where the choice had no more steps to give, their residual may be larger.
     let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };

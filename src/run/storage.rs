@@ -9,6 +9,7 @@ use super::stop::RunEnd;
 use super::transaction::{transaction, with};
 use crate::backend::{Backend, Storage};
 use crate::flow::{Extras, Precision, Traced, VelocitySource};
+use crate::progress::Work;
 use crate::surrogate::Trace;
 
 /// Largest optical residual of the device, in units of what the steps may have or have at the same points.
@@ -41,6 +42,7 @@ impl<B: Backend> Cycle<'_, B> {
         }
         let why = match compared {
             Some(comparison) => {
+                let _work = Work::begin("comparing half precision with double");
                 let mut traced = Traced::default();
                 transaction!(self, slide, run, on => {
                     let tracer = on.tracer();

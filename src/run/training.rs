@@ -2,7 +2,7 @@
 
 use super::{RunError, Settings, TrainingSettings};
 use crate::backend::DeviceError;
-use crate::progress;
+use crate::progress::Work;
 use crate::surrogate::{Kind, Learned};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -111,8 +111,14 @@ pub(super) fn train(
     const SLICE_STEPS: u64 = 32;
     let start = Instant::now();
     let (mut sum, mut result) = (Learned::default(), Ok(()));
+    let work = Work::begin("training");
     while !stop.load(Ordering::Relaxed) {
-        progress::mark();
+        work.reached_share(match (settings.steps_per_frame, until) {
+            (Some(steps), _) => sum.steps as f64 / steps.max(1) as f64,
+            (None, Until::Seconds(seconds)) => (start.elapsed().as_secs_f64() / seconds).min(1.0),
+            // The frame tells how far it is.
+            (None, Until::Rendered(_)) => 0.0,
+        });
         let (seconds, steps) = match settings.steps_per_frame {
             Some(steps) if sum.steps >= steps => break,
             Some(steps) => (f64::INFINITY, (steps - sum.steps).min(SLICE_STEPS)),

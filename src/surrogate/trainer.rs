@@ -10,6 +10,7 @@ use super::{Learned, NetworkFrom, ReplayBuffer, SurrogateError};
 use copy::{Copies, PendingCopy};
 use progress::Progress;
 use ridgewatch_base::DeviceError;
+use ridgewatch_base::progress::Work;
 use ridgewatch_flow::Tracer;
 use std::sync::Arc;
 use std::time::Instant;
@@ -186,6 +187,8 @@ impl<T: Training> Trainer<T> {
         let count = self.settings.batch().min(usable.max(256));
         let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
         let began = self.training.steps_taken();
+        // Without a number of steps, the caller knows when it ends.
+        let work = (max_steps < u64::MAX).then(|| Work::begin("optimizer steps"));
         while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
             let steps = self.training.steps_taken();
             // The first step of a call is the most likely to diverge, but short calls should not need a copy.
@@ -224,6 +227,7 @@ impl<T: Training> Trainer<T> {
                 }
             }
             learned.steps = self.training.steps_taken().saturating_sub(began) as u64;
+            work.iter().for_each(|work| work.reached_share(learned.steps as f64 / max_steps as f64));
         }
         if self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY {
             self.training.restart_average()?;

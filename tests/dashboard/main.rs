@@ -9,6 +9,7 @@ mod program;
 mod steering;
 mod values;
 mod visitor;
+mod work;
 
 use kit::publishing;
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};

@@ -11,13 +11,13 @@ use std::process::Command;
 use std::time::Duration;
 
 /// Address and token of a printed URL.
-fn parts(url: &str) -> (SocketAddr, String) {
+pub fn parts(url: &str) -> (SocketAddr, String) {
     let (address, token) = url.strip_prefix("http://").unwrap().split_once("/?token=").unwrap();
     (address.parse().unwrap(), token.to_owned())
 }
 
 /// Waits for the URL that is printed as JSON.
-fn url(running: &Running) -> String {
+pub fn url(running: &Running) -> String {
     until("an address", || running.stdout().contains('}'));
     let mut values =
         serde_json::Deserializer::from_str(&running.stdout()).into_iter::<serde_json::Value>().map(Result::unwrap).collect::<Vec<_>>();

@@ -55,7 +55,7 @@ fn gyre() -> Analytic {
     Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TAU / 10.0 }
 }
 
-fn double_gyre() -> (VelocitySource, Domain) {
+pub fn double_gyre() -> (VelocitySource, Domain) {
     let domain = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
     (VelocitySource::Analytic(gyre(), domain.clone()), domain)
 }

@@ -2,7 +2,14 @@
 
 use super::command::ocean;
 use crate::kit::program::{config, json, ridgewatch, run, set, summary, text};
+use crate::kit::scene::{double_gyre, setup};
+use ridgewatch::backend::Device;
+use ridgewatch::map::{MapError, SlideMaps};
+use ridgewatch::progress::work;
+use ridgewatch::run::ShownSlide;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 /// Names in a folder, in order; none if it does not exist.
 fn names(folder: &Path) -> Vec<String> {
@@ -147,4 +154,28 @@ fn keys_of_maps_that_do_nothing_are_told() {
     let volume = run(&mut ridgewatch([&["replay", &config("abc.toml"), "--device", "cpu", "--out", text(&out)][..], &set(&keys)].concat()))
         .success();
     assert!(volume.stderr.contains("without effect on a flow of three dimensions: maps"), "{}", volume.stderr);
+}
+
+/// On one thread, so that each of its four parts takes long on any machine.
+#[test]
+fn the_map_of_a_slide_tells_the_time_left() {
+    let mut scene = setup(&double_gyre([1024, 512, 1], "time.tau = 10\nflow.steps = 400\n"), &[]);
+    let stop = AtomicBool::new(false);
+    let slide = scene.slides.next_slide(&stop).unwrap().unwrap();
+    let map = scene.plan.map.clone();
+    let mut maps = SlideMaps::new(&scene.plan, &Device::Cpu { why: None }).unwrap();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let told = std::thread::scope(|scope| {
+        let drawing =
+            scope.spawn(|| pool.install(|| maps.draw(ShownSlide { slide, asked: map.clone(), map, is_new: true, next: None }, &stop)));
+        let mut told = None;
+        while told.is_none() && !drawing.is_finished() {
+            told = work().filter(|text| text.starts_with("drawing the map of the slide: "));
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        stop.store(true, Ordering::Relaxed);
+        assert!(matches!(drawing.join().unwrap(), Err(MapError::Stopped)));
+        told.unwrap()
+    });
+    assert!(told.contains(" %, about ") && told.ends_with(" left"), "{told}");
 }

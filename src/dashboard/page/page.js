@@ -154,6 +154,7 @@ function currentView() {
     endpoint: server?.endpoint,
     problem: server?.problem,
     silence: silence(),
+    work: server?.work,
     record: newest,
     back: back ? { record: back, behind: newest === null ? null : newest.frame - back.frame } : null,
   };

@@ -110,19 +110,25 @@ export function frameWords(record) {
   return [`frame ${count(record.frame)}`, `slide ${count(record.slide)}`, stepWords(record), when, ...state].filter(Boolean).join(", ");
 }
 
-/** The sentence of state. `view` has `link`, `status`, `endpoint`, `silence` (seconds), `record` (newest) and `back` (`{ record, behind }` while looking back). */
+/** The sentence of state. `view` has `link`, `status`, `endpoint`, `silence` (seconds), `work` (what the run is at for long, in words), `record` (newest) and `back` (`{ record, behind }` while looking back). */
 export function sentence(view) {
+  const state = stateWords(view);
+  const isNow = view.link === "open" && !view.back;
+  return isNow && view.work ? `${state}; now ${view.work}.` : `${state}.`;
+}
+
+function stateWords(view) {
   const words = view.record ? frameWords(view.record) : null;
-  if (view.back) return `Looking back, ${count(view.back.behind)} frames before the newest: ${frameWords(view.back.record)}.`;
+  if (view.back) return `Looking back, ${count(view.back.behind)} frames before the newest: ${frameWords(view.back.record)}`;
   if (view.link !== "open") {
     const state = { connecting: "Connecting", refused: "Not admitted" }[view.link] ?? "Not connected";
-    return words ? `${state}; last seen: ${words}.` : `${state}.`;
+    return words ? `${state}; last seen: ${words}` : state;
   }
-  if (view.status === "silent") return words ? `Silent for ${duration(view.silence)}; last: ${words}.` : `Silent for ${duration(view.silence)}.`;
-  if (view.status === "paused" && words) return `The window is paused, ${words}.`;
-  if (view.status === "waiting" && words) return `Waiting for the publisher; last seen: ${words}.`;
-  if (words) return `Following, ${words}.`;
-  return view.endpoint ? `Waiting for the first frame from ${view.endpoint}.` : "Waiting for the first frame.";
+  if (view.status === "silent") return words ? `Silent for ${duration(view.silence)}; last: ${words}` : `Silent for ${duration(view.silence)}`;
+  if (view.status === "paused" && words) return `The window is paused, ${words}`;
+  if (view.status === "waiting" && words) return `Waiting for the publisher; last seen: ${words}`;
+  if (words) return `Following, ${words}`;
+  return view.endpoint ? `Waiting for the first frame from ${view.endpoint}` : "Waiting for the first frame";
 }
 
 /** Time span of the flow map: from t0 by tau, in the direction. */

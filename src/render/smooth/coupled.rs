@@ -281,13 +281,15 @@ pub(super) struct CoupledCounts {
     pub(super) stopped: bool,
 }
 
-/// Tracks one path per (pixel, sample) and returns the differences in this order. All flights advance together, in waves.
+/// Tracks one path per (pixel, sample) and returns the differences in this order. All flights advance together, in waves. `reached` gets the number of
+/// paths that are complete.
 pub(super) fn track(
     medium: &Medium<'_>,
     paths: &[(u32, u32)],
     wave_flights: usize,
     answers: &mut dyn LogStretch,
     stop: &AtomicBool,
+    reached: &dyn Fn(usize),
 ) -> (Vec<CoupledPath>, CoupledCounts) {
     let mut found = Vec::with_capacity(paths.len());
     let mut counts = CoupledCounts::default();
@@ -333,6 +335,7 @@ pub(super) fn track(
             break;
         }
         found.extend(flights.iter().map(CoupledFlight::found));
+        reached(found.len());
     }
     (found, counts)
 }
@@ -346,5 +349,5 @@ pub fn coupled_paths(
     wave_flights: usize,
     answers: &mut dyn LogStretch,
 ) -> Vec<CoupledPath> {
-    track(&Medium { scene, nodes, missing }, paths, wave_flights, answers, &AtomicBool::new(false)).0
+    track(&Medium { scene, nodes, missing }, paths, wave_flights, answers, &AtomicBool::new(false), &|_| ()).0
 }

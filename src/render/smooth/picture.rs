@@ -16,9 +16,9 @@ use crate::rng::FrameRandom;
 use crate::tracking::FrameScene;
 use crate::{Film, LogStretch, Method, Scene};
 use rayon::prelude::*;
-use ridgewatch_base::progress;
+use ridgewatch_base::progress::{self, Work};
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 /// Largest number of values of the light volume on the CPU.
@@ -165,19 +165,21 @@ impl Picture {
             return 0.0;
         }
         let began = Instant::now();
+        let (work, done) = (Work::begin("marching rays"), AtomicUsize::new(0));
         let refine = self.march.refine();
         let light = &*self.light.get_or_insert_with(|| LightVolume::new(medium, LIGHT_VALUES, refine));
         let step = medium.spacing() as f32 * self.march.step;
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
         let mended = round.is_mended();
+        let all = self.base.len();
         let marched = |pixel: u32, j: u64| match mended {
             true => medium.mended_ray(pixel, j, step, light),
             false => medium.ray(pixel, j, step, ToLight::Volume(light), false),
         };
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
             if pixel % MARKED == 0 {
-                progress::mark();
+                work.reached(done.fetch_add(MARKED, Ordering::Relaxed).min(all), all);
             }
             for j in rays.clone().take_while(|_| !round.stop.load(Ordering::Relaxed)) {
                 sum.add(&marched(pixel as u32, j));
@@ -236,6 +238,7 @@ impl Picture {
         // Number of each pair within its pixel, which selects its random numbers.
         let mut next: Vec<u32> = self.sums.iter().map(PairSums::pairs).collect();
         let mut stats = RenderStats::default();
+        let (work, all) = (Work::begin("drawing samples"), 2 * plan.iter().map(|tile| tile.pairs).sum::<usize>());
         let mut paths = Vec::new();
         while chosen.peek().is_some() {
             paths.clear();
@@ -244,7 +247,9 @@ impl Picture {
                 paths.extend([(pixel, 2 * *number), (pixel, 2 * *number + 1)]);
                 *number += 1;
             }
-            let (found, counts) = track(medium, &paths, wave_flights, answers, round.stop);
+            let before = stats.paths as usize;
+            let reached = |paths: usize| work.reached(before + paths, all);
+            let (found, counts) = track(medium, &paths, wave_flights, answers, round.stop, &reached);
             if counts.stopped {
                 return None;
             }

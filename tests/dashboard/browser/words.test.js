@@ -83,6 +83,14 @@ test("a lost connection, a silent publisher and looking back are said first", ()
   assert.equal(sentence({ link: "open", status: "waiting", endpoint: "ipc:///x" }), "Waiting for the first frame from ipc:///x.");
 });
 
+test("what a run is at for long is said as long as the page is connected", () => {
+  const work = "tracing the table: 25 %, about 9 s left";
+  assert.equal(sentence({ link: "open", status: "waiting", endpoint: "ipc:///x", work }), `Waiting for the first frame from ipc:///x; now ${work}.`);
+  assert.equal(sentence({ ...following, work }), sentence(following).replace(/\.$/, `; now ${work}.`));
+  assert.equal(sentence({ ...following, work: undefined }), sentence(following));
+  for (const change of [{ link: "lost" }, { back: { record, behind: 20 } }]) assert.doesNotMatch(sentence({ ...following, ...change, work }), /tracing/);
+});
+
 test("the window lies on the side of t0 to which particles are followed", () => {
   assert.equal(windowWords(record), "3.2 to 1.2 s");
   assert.equal(windowWords({ ...record, direction: "forward" }), "3.2 to 5.2 s");
