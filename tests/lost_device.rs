@@ -682,6 +682,61 @@ fn a_shortage_keeps_what_was_learned() {
     }
 }
 
+/// A network that was fitted to the device keeps its shape on the CPU, which takes steps of its own batches.
+#[test]
+fn a_fitted_network_goes_on_in_batches_of_the_cpu() {
+    const ON_CPU: u64 = 1 << 14;
+    // Each frame's audit draws more labels than a batch of the CPU takes.
+    let scene = |batch: &str| {
+        let keys = format!(
+            "
+            source.nodes = [96, 8, 8]
+            source.snapshots = 6
+            time.tau = 4
+            time.slides = 1
+            time.frames_per_slide = 4
+            flow.steps = 8
+            trust.cells = [2, 2, 2]
+            trust.audit_min_per_cell = 4096
+            trust.audit_max_per_cell = 4096
+            surrogate.kind = \"network\"
+            network.width = 16
+            {batch}
+            training.steps_per_frame = 2"
+        );
+        scene::parse(&scene::scene("turbulence", [16, 8, 2], &keys), &[]).unwrap()
+    };
+    let decision = |made: &Made, of: &str| made.decisions.iter().find(|d| d.setting == of).map(|d| (d.chosen.clone(), d.why.clone()));
+    // Samples of a step while the last frame was made.
+    let last_batch = |made: &Made| {
+        let learned = made.records.last().unwrap().training.clone().unwrap();
+        learned.samples / learned.steps
+    };
+    let whole = made(Breaking::on(&Line::new(usize::MAX, How::Fault)), &scene(""));
+    assert!(whole.error.is_none() && last_batch(&whole) > ON_CPU, "{:?}: {}", whole.error, last_batch(&whole));
+    assert_eq!((decision(&whole, "network.batch").unwrap().0, whole.count("network.batch")), ((1 << 18).to_string(), 0));
+
+    for how in [How::Fault, How::Shortage(1)] {
+        // In the third frame: a step of the CPU is a call.
+        let line = Line::of_kind(Some("taking steps"), 5, how);
+        let found = made(Breaking { plans: 0, ..Breaking::on(&line) }, &scene(""));
+        assert!(found.error.is_none() && found.count(ENDED) == 1, "{how:?}: {:?}", found.error);
+        assert_eq!(last_batch(&found), ON_CPU, "{how:?}");
+        let (chosen, why) = decision(&found, "network.batch").unwrap();
+        assert!(chosen == ON_CPU.to_string() && why.contains("the CPU trains the network"), "{how:?}: {chosen}, {why}");
+        assert_eq!(found.count(&format!("network.batch = {ON_CPU}: the CPU trains the network")), 1, "{how:?}: told once");
+        for size in ["network.levels", "network.growth", "network.base_resolution", "network.log2_table"] {
+            assert_eq!(decision(&found, size), decision(&whole, size), "{how:?}: weights keep their shape");
+        }
+    }
+
+    // A batch that is given stays, and a device that refuses the first window leaves a network of the CPU.
+    let given = made(Breaking::on(&Line::of_kind(Some("taking steps"), 5, How::Fault)), &scene("network.batch = 20000"));
+    assert_eq!((last_batch(&given), given.count("network.batch"), decision(&given, "network.batch")), (20_000, 0, None));
+    let never = made(Breaking { may_fall_back: true, ..Breaking::on(&Line::new(0, How::Shortage(usize::MAX))) }, &scene(""));
+    assert_eq!((last_batch(&never), decision(&never, "network.batch"), decision(&never, "network.levels")), (ON_CPU, None, None));
+}
+
 /// The table of a window is gone before the next one is traced, and so under a checkpoint that takes long.
 #[test]
 fn a_slide_finds_the_old_table_gone() {

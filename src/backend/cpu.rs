@@ -39,6 +39,10 @@ impl Backend for Cpu {
         "cpu".into()
     }
 
+    fn is_gpu(&self) -> bool {
+        false
+    }
+
     fn prefetch(&self) -> Option<Listener> {
         None
     }

@@ -120,6 +120,11 @@ pub trait Backend: Send + Sync + Sized {
         NODES_PER_SAMPLE
     }
 
+    /// Returns true if a device other than the CPU computes.
+    fn is_gpu(&self) -> bool {
+        true
+    }
+
     /// Reaction to a lost device.
     fn when_lost(&self) -> WhenLost {
         WhenLost::Cpu

@@ -129,7 +129,7 @@ impl Training<'_> {
         };
         let mut surrogate = backend.surrogate(&request, &tracer).map_err(failed)?;
         let buffer = ReplayBuffer::holding(&labels);
-        let steps_per_epoch = (labels.len() / settings.network.batch()).max(1) as u64;
+        let steps_per_epoch = (labels.len() / settings.network.batch_on(surrogate.trains_on_device())).max(1) as u64;
         let mut report =
             TrainReport { epochs: Vec::new(), label_seconds, bytes: surrogate.bytes(), device: backend.name(), interrupted: false };
         let (mut steps, mut seconds, mut rollbacks) = (0, 0.0, 0);

@@ -394,7 +394,7 @@ fn drive<B: Backend>(
     };
     slide.warnings.append(&mut beginning.warnings);
     let from = RunGiven { plan: &plan, options, threads, stop, began, earlier_race, report };
-    let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
+    let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), on.backend.is_gpu(), &slide))?;
     sink(Event::Note(run.colours()));
     if let VelocitySource::Window(window) = &slide.velocity
         && window.is_flat()
@@ -470,7 +470,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
 }
 
 impl<'a> Run<'a> {
-    fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
+    fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, is_gpu: bool, first: &Slide) -> Result<Self, RunEnd> {
         let RunGiven { plan, options, threads, stop, began, earlier_race, report } = frame;
         let scene = &plan.scene;
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
@@ -508,7 +508,7 @@ impl<'a> Run<'a> {
         let sized = scene.render.method.has_surrogate() && scene.network.size == Size::Auto;
         let learns = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Table;
         let network = match &first.velocity {
-            VelocitySource::Window(window) if learns && options.device.is_gpu() => {
+            VelocitySource::Window(window) if learns && is_gpu => {
                 window.grid().map(|grid| suited_network(&scene.network, grid.shape(), &mut report.decisions))
             }
             _ => None,

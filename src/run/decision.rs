@@ -79,11 +79,11 @@ pub fn why_steps(difference: f64, residual: Option<f64>) -> String {
     }
 }
 
-/// Settings that [`suited_network`] chooses.
+/// Settings that [`suited_network`] chooses, and [`cpu_batch`].
 const NETWORK_SIZES: [&str; 5] = ["network.levels", "network.growth", "network.base_resolution", "network.log2_table", "network.batch"];
 
 /// The network with sizes that suit a window of `shape` nodes where they are open, and enters these choices.
-pub(super) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisions: &mut Vec<Decision>) -> NetworkSettings {
+pub(crate) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisions: &mut Vec<Decision>) -> NetworkSettings {
     let suited = given.suited_to(shape);
     let longest = shape.into_iter().max().unwrap_or(1);
     let few = "few fine levels, which a GPU learns soonest".to_owned();
@@ -97,10 +97,22 @@ pub(super) fn suited_network(given: &NetworkSettings, shape: [usize; 3], decisio
             suited.log2_table().to_string(),
             "holds the nodes of the finest level, up to 2^24".to_owned(),
         ),
-        (given.batch == suited.batch, suited.batch().to_string(), "large batches keep a GPU busy".to_owned()),
+        (suited.gpu_batch.is_none(), suited.batch_on(true).to_string(), "large batches keep a GPU busy".to_owned()),
     ];
     for (setting, (_, value, why)) in NETWORK_SIZES.into_iter().zip(chosen).filter(|(_, (is_given, ..))| !is_given) {
         Decision::new(setting, value, why).enter(decisions);
     }
     suited
+}
+
+/// Leaves batches that were chosen for a GPU, since the CPU trains the network; its shape stays, with its weights. Enters the choice, and returns it
+/// in words. `None`: no batch was chosen for a GPU.
+pub(crate) fn cpu_batch(network: &mut NetworkSettings, decisions: &mut Vec<Decision>) -> Option<String> {
+    let on_gpu = network.gpu_batch.take()?;
+    let batch = network.batch_on(false);
+    let chosen =
+        Decision::new("network.batch", batch, format_args!("the CPU trains the network, for which steps of {on_gpu} samples are long"));
+    let words = chosen.to_string();
+    chosen.enter(decisions);
+    Some(words)
 }

@@ -4,6 +4,7 @@ use super::assess::{Work, assess};
 use super::budget::FrameCost;
 use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
+use super::decision::cpu_batch;
 use super::record::{DomainRecord, Frame};
 use super::setup::Plan;
 use super::slides::{Slide, Slides};
@@ -199,6 +200,9 @@ impl Run<'_> {
         let method = self.render.method;
         let (serves, is_smooth) = (method.has_surrogate(), method.is_smooth());
         let learns = serves && on.surrogate.as_ref().is_some_and(Surrogate::learns);
+        if learns && !self.threads.device_trains {
+            self.progress.warnings.extend(cpu_batch(&mut self.learning.network, &mut self.report.decisions));
+        }
         // A smooth picture measures its own error, so that labels of a table have no use.
         let needs_labels = serves && (learns || !is_smooth);
         let (extras, keep) = (self.label_extras(), if needs_labels { self.labels_per_frame(on) } else { 0 });

@@ -168,7 +168,7 @@ impl<T: Training> Trainer<T> {
         max_steps: u64,
         learned: &mut Learned,
     ) -> Result<(), DeviceError> {
-        let samples = labels.buffer.samples();
+        let (samples, batch) = (labels.buffer.samples(), self.settings.batch_on(self.training.is_on_device()));
         if !self.standardised && (0..samples.len()).any(|index| self.objective.is_usable(samples, index)) {
             let base = labels.base.map(SurrogateTable::to_host).transpose()?;
             self.objective.standardise(self.training.shape(), samples, base.as_ref().map(|base| base as &dyn Field));
@@ -176,7 +176,7 @@ impl<T: Training> Trainer<T> {
         }
         // The network moves to the device together with the scale of the targets, so the scale must be known first.
         if self.standardised {
-            self.training.begin(&self.objective, labels.buffer.capacity(), self.settings.batch())?;
+            self.training.begin(&self.objective, labels.buffer.capacity(), batch)?;
         }
         let SyncedSamples { usable, dropped } = self.training.sync(&self.objective, labels)?;
         learned.dropped = dropped as u64;
@@ -184,7 +184,7 @@ impl<T: Training> Trainer<T> {
             return Ok(());
         }
         // With few samples, a large batch would only repeat them.
-        let count = self.settings.batch().min(usable.max(256));
+        let count = batch.min(usable.max(256));
         let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
         let began = self.training.steps_taken();
         // Without a number of steps, the caller knows when it ends.

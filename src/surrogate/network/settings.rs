@@ -95,8 +95,11 @@ pub struct NetworkSettings {
     pub mean_penalty: f32,
     /// Learning rate of Adam; `None`: 1e-2 for hash grids, 1e-3 for frequency encodings (published: 1e-4, for a day of training).
     pub learning_rate: Option<f32>,
-    /// Samples of an optimizer step; `None`: see [`Self::suited_to`].
+    /// Samples of an optimizer step; `None`: see [`Self::batch_on`].
     pub batch: Option<usize>,
+    /// Samples of an optimizer step of a GPU where `batch` is open, which [`Self::suited_to`] chooses. No key of a scene.
+    #[serde(skip)]
+    pub gpu_batch: Option<usize>,
     /// Gives shorter axes of the domain fewer cells, so that cells are about as wide as high.
     pub scale_levels_by_aspect: bool,
     /// Weight of the flow map's derivatives in the loss (target `flow_map`). 0 trains on arrivals alone, which renders better after the
@@ -126,6 +129,7 @@ impl Default for NetworkSettings {
             mean_penalty: 1.0,
             learning_rate: None,
             batch: None,
+            gpu_batch: None,
             scale_levels_by_aspect: true,
             jacobian_weight: 0.0,
             averaging: 0.1,
@@ -154,13 +158,13 @@ impl NetworkSettings {
         self.growth.unwrap_or(1.6)
     }
 
-    /// Samples of an optimizer step: as given, or 2^14.
-    pub fn batch(&self) -> usize {
-        self.batch.unwrap_or(1 << 14)
+    /// Samples of an optimizer step that a GPU takes, or the CPU: as given, or what suits a GPU (see [`Self::suited_to`]), or 2^14.
+    pub fn batch_on(&self, is_gpu: bool) -> usize {
+        self.batch.or(self.gpu_batch.filter(|_| is_gpu)).unwrap_or(1 << 14)
     }
 
-    /// With sizes for training on a GPU over a window of `shape` nodes along x, y, z, where they are open: a batch of 2^18, and, if nothing of the
-    /// hash grid is given, three levels that double nearly, of which the finest has two thirds as many cells as the window has nodes along its
+    /// With sizes for training on a GPU over a window of `shape` nodes along x, y, z, where they are open: a batch of 2^18 as long as the GPU takes
+    /// the steps, and, if nothing of the hash grid is given, three levels that double nearly, of which the finest has two thirds as many cells as the window has nodes along its
     /// longest axis, and a table that holds its nodes. A few fine levels learnt 600x192x192 nodes, the only window tried, soonest. Windows of two
     /// dimensions or with fewer than 96 nodes along the longest axis keep the defaults, as do networks that the CPU trains or whose size is searched.
     #[must_use]
@@ -173,7 +177,7 @@ impl NetworkSettings {
         if !is_plain || shape.contains(&1) || longest < FEW_NODES {
             return self.clone();
         }
-        let suited = Self { batch: self.batch.or(Some(1 << 18)), ..self.clone() };
+        let suited = Self { gpu_batch: self.batch.is_none().then_some(1 << 18), ..self.clone() };
         if self.levels.is_some() || self.growth.is_some() || self.base_resolution.is_some() || self.log2_table.is_some() {
             return suited;
         }
@@ -229,7 +233,7 @@ impl NetworkSettings {
         check("mean_penalty", self.mean_penalty, 0.0, 1e6)?;
         check("jacobian_weight", self.jacobian_weight, 0.0, 1e6)?;
         check("averaging", self.averaging, 0.0, 1.0)?;
-        check("batch", self.batch(), 64, 1 << 22)?;
+        check("batch", self.batch_on(false), 64, 1 << 22)?;
         self.learning_rate.map_or(Ok(()), |rate| check("learning_rate", rate, 1e-9, 1.0))
     }
 }
@@ -252,9 +256,12 @@ mod tests {
     fn sizes_that_are_open_suit_the_window() {
         let open = NetworkSettings::default();
         let sizes = |network: NetworkSettings| {
-            (network.levels(), network.growth(), network.base_resolution(), network.log2_table(), network.batch())
+            (network.levels(), network.growth(), network.base_resolution(), network.log2_table(), network.batch_on(true))
         };
         assert_eq!(sizes(open.suited_to([600, 192, 192])), (3, 1.8, 123, 23, 1 << 18));
+        assert_eq!(open.suited_to([600, 192, 192]).batch_on(false), 1 << 14, "the CPU takes steps of its own");
+        let named = NetworkSettings { batch: Some(512), ..open.clone() }.suited_to([600, 192, 192]);
+        assert_eq!([true, false].map(|is_gpu| named.batch_on(is_gpu)), [512; 2]);
         let given = NetworkSettings { log2_table: Some(19), ..open.clone() };
         assert_eq!(
             sizes(given.suited_to([600, 192, 192])),
