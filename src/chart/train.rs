@@ -9,7 +9,7 @@ use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device, FrameJob, Interruptible, Rendered, Routing, Surrogate as _, SurrogateRequest};
 use crate::flow::Extras;
 use crate::render::{Film, Renderer, Scene};
-use crate::run::{RunError, Settings};
+use crate::run::{Decision, RunError, Settings, cpu_batch, suited_network};
 use crate::surrogate::{Predict, ReplayBuffer, Samples};
 use crate::trust::Gate;
 use serde::Serialize;
@@ -66,6 +66,8 @@ pub struct TrainReport {
     pub bytes: usize,
     /// The device, as in the records.
     pub device: String,
+    /// Sizes of the network that the scene leaves open, as a run on this device chooses them.
+    pub decisions: Vec<Decision>,
     /// True if a stop ended it early.
     pub interrupted: bool,
 }
@@ -87,12 +89,16 @@ pub fn train(
     let slides = FirstSlides::read(settings, 1, stop)?;
     let opened = Opened::new(settings, device, &slides)?;
     let colours = colours_of(settings, device, &slides)?;
-    let settings = Settings { transfer: Some(colours), ..slides.settled(settings) };
+    let mut settings = Settings { transfer: Some(colours), ..slides.settled(settings) };
+    let mut decisions = Vec::new();
+    if let Some(shape) = opened.shape().filter(|_| device.is_gpu()) {
+        settings.network = suited_network(&settings.network, shape, &mut decisions);
+    }
     let training = Training { settings: &settings, options, opened: &opened, stop };
     pool.install(|| match device {
-        Device::Cpu { .. } => training.on(Cpu, epoch),
+        Device::Cpu { .. } => training.on(Cpu, decisions, epoch),
         #[cfg(feature = "cuda")]
-        Device::Cuda(device) => training.on(Cuda::new(device), epoch),
+        Device::Cuda(device) => training.on(Cuda::new(device), decisions, epoch),
     })
 }
 
@@ -104,7 +110,12 @@ struct Training<'a> {
 }
 
 impl Training<'_> {
-    fn on<B: Backend>(&self, mut backend: B, epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send)) -> Result<TrainReport, RunError> {
+    fn on<B: Backend>(
+        &self,
+        mut backend: B,
+        mut decisions: Vec<Decision>,
+        epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send),
+    ) -> Result<TrainReport, RunError> {
         let Self { settings, options, opened, stop } = self;
         let (plan, slide) = (&opened.plan, &opened.slide);
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
@@ -129,9 +140,14 @@ impl Training<'_> {
         };
         let mut surrogate = backend.surrogate(&request, &tracer).map_err(failed)?;
         let buffer = ReplayBuffer::holding(&labels);
-        let steps_per_epoch = (labels.len() / settings.network.batch_on(surrogate.trains_on_device())).max(1) as u64;
-        let mut report =
-            TrainReport { epochs: Vec::new(), label_seconds, bytes: surrogate.bytes(), device: backend.name(), interrupted: false };
+        let on_device = surrogate.trains_on_device();
+        if !on_device {
+            // Taken by the trainer as well.
+            cpu_batch(&mut settings.network.clone(), &mut decisions);
+        }
+        let steps_per_epoch = (labels.len() / settings.network.batch_on(on_device)).max(1) as u64;
+        let (bytes, device) = (surrogate.bytes(), backend.name());
+        let mut report = TrainReport { epochs: Vec::new(), label_seconds, bytes, device, decisions, interrupted: false };
         let (mut steps, mut seconds, mut rollbacks) = (0, 0.0, 0);
         for number in 1..=options.epochs {
             let learned = surrogate.learn(&buffer, f64::INFINITY, steps_per_epoch).map_err(failed)?;

@@ -37,6 +37,7 @@ pub use checkpoints::CheckpointTotals;
 pub use color_bar::ColorBar;
 pub use cycle::{Event, RunOptions, RunReport, ShownSlide, run, run_on};
 pub use decision::{Decision, why_steps};
+pub(crate) use decision::{cpu_batch, suited_network};
 pub use error::RunError;
 pub use race::Race;
 pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};

@@ -6,10 +6,12 @@ use super::small;
 use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, GpuSettings, SnapshotStore, Tuning};
 use ridgewatch::backend::{Device, WhenLost};
+use ridgewatch::chart::{TrainOptions, train};
 use ridgewatch::publish::compare_films;
-use ridgewatch::run::{Frame, RunOptions};
+use ridgewatch::run::{Decision, Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, ReplayBuffer};
+use std::sync::atomic::AtomicBool;
 
 /// A small run that trains a fixed number of steps a frame.
 fn turbulence() -> String {
@@ -370,4 +372,34 @@ fn bricks_of_a_network_that_is_not_trusted_are_traced() {
     // Every node, and what opens the gate.
     let first = [&found[0].record, &expected[0].record].map(|record| record.preparation_traces);
     assert!(first[0] == first[1] && first[0] >= 80_000, "{first:?}");
+}
+
+/// Offline training takes the sizes that a run takes where the scene leaves them open, and says so in the same words.
+#[test]
+#[ignore = "needs a GPU"]
+fn offline_training_is_fitted_to_the_window_as_a_run_is() {
+    let keys = "
+        source.nodes = [96, 12, 12]
+        source.snapshots = 6
+        time.tau = 4
+        time.slides = 1
+        flow.steps = 8
+        surrogate.kind = \"network\"
+        network.width = 16
+        training.steps_per_frame = 1
+    ";
+    let text = scene::scene("turbulence", [16, 8, 2], keys);
+    let device = device(GpuSettings::default());
+    let of_network = |decisions: Vec<Decision>| -> Vec<Decision> {
+        decisions.into_iter().filter(|decision| decision.setting.starts_with("network.")).collect()
+    };
+    let options = RunOptions { device: device.clone(), ..RunOptions::default() };
+    let expected = of_network(scene::run_frames(scene::setup(&text, &[]), &options, |_| ()).decisions);
+    let wanted = TrainOptions { epochs: 1, labels: 1 << 12, validation: 1 << 10, pictures: Vec::new() };
+    let settings = scene::parse(&text, &[]).unwrap().settings();
+    let report = train(&settings, &wanted, &device, 0, &mut |_, _| (), &AtomicBool::new(false)).unwrap();
+    assert_eq!(expected.len(), 5, "{expected:?}");
+    assert_eq!(of_network(report.decisions), expected);
+    let report = train(&settings, &wanted, &Device::CPU, 0, &mut |_, _| (), &AtomicBool::new(false)).unwrap();
+    assert!(report.decisions.is_empty(), "{:?}", report.decisions);
 }
