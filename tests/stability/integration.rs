@@ -2,7 +2,9 @@
 
 use crate::kit::flow::{EVERYTHING, trace};
 use crate::kit::scene;
-use crate::sweep::{TOLERANCE, adaptive, bisect, double_gyre, gyre_box, in_square, lattice, map, rms_difference, row, traced, window};
+use crate::sweep::{
+    TOLERANCE, adaptive, bisect, decibels, double_gyre, gyre_box, in_square, lattice, map, map_psnr, rms_difference, row, traced, window,
+};
 use ridgewatch::field::{Axis, Domain, DomainPoint, Geometry, Grid, Snapshot, analytic::Analytic};
 use ridgewatch::flow::{
     Boundary, Extras, FlowError, FlowMap, IntegrationDifferences, Integrator, Interpolation, Precision, Steps, VelocitySource, cpu_tracer,
@@ -90,7 +92,19 @@ fn difference_gap() {
             Some((_, least)) => format!("refuses gaps below {least:.1e}, where pairs coincide; {always}"),
             None => always,
         };
-        let error = format!("at best {least:.1e} (gap {best:.0e}), {last:.1e} at the smallest; tangent {tangent:.1e}");
+        let picture = |gap: f64| {
+            let map = FlowMap { integrator: Integrator::Differences, difference_step: gap, ..map(TAU, 200, precision) };
+            map_psnr(&traced(&source, &map, 0.0, &seeds), &exact)
+        };
+        let pictures = [wide.0, best, smallest].map(picture);
+        // In f64 the smallest gap is as good as the best.
+        assert!(pictures[0] < pictures[1] && (precision == Precision::F64 || pictures[2] < pictures[1]), "{pictures:?}");
+        let [of_wide, of_best, of_smallest] = pictures.map(decibels);
+        let error = format!(
+            "at best {least:.1e} (gap {best:.0e}), {last:.1e} at the smallest; tangent {tangent:.1e}; map {of_wide} at a gap of {:.0e}, {of_best} at the \
+             best, {of_smallest} at the smallest",
+            wide.0
+        );
         row([&name, &range, &number, &does, &error, "difference_gap"]);
     }
 }
@@ -138,7 +152,9 @@ fn steps_beyond_the_stability_limit() {
             &format!("rate x step above {found:.3}"),
             &format!("`integration_difference`: {told:.0} at 1.2 times the limit"),
             &format!("`steps = \"auto\"` takes rate x step {z:.2}; a given number is obeyed, with a warning above {TOLERANCE}"),
-            &format!("auto {error:.1e} of the log-stretch; at 1.2 times the limit FTLE {wrong:.2} of the rate instead of {rate:.0}"),
+            &format!(
+                "auto {error:.1e} of the log-stretch; at 1.2 times the limit FTLE {wrong:.2} of the rate instead of {rate:.0}, in every pixel"
+            ),
             "steps_beyond_the_stability_limit",
         ]);
     }
@@ -204,6 +220,8 @@ fn steps_too_long_for_a_shear_that_turns() {
     let auto = with(Steps::Auto { tolerance: TOLERANCE_ON_GRIDS });
     let (taken, by_auto) = (cpu_tracer(source.clone(), &auto, 0.0).unwrap().steps() / TURNS, error(&auto));
     assert!(taken >= first.0 && by_auto < TOLERANCE, "{taken} steps a turn: {by_auto:e}");
+    let pictures = [last.0, first.0].map(|a_turn| map_psnr(&traced(&source, &with(Steps::Fixed(a_turn * TURNS)), 0.0, &seeds), &exact));
+    assert!(pictures[0] < pictures[1], "{pictures:?}");
     row([
         "RK4 steps, shear that turns",
         &format!("{} steps a turn (rate x step {:.2}); {} hold", last.0, RATE / last.0 as f64, first.0),
@@ -212,7 +230,15 @@ fn steps_too_long_for_a_shear_that_turns() {
             "`steps = \"auto\"` takes {taken} a turn: two a snapshot interval or more; a given number is obeyed, with a warning above \
              {TOLERANCE_ON_GRIDS}"
         ),
-        &format!("{:.2} of the log-stretch there, {:.0e} with {}; auto {by_auto:.0e}", last.1, first.1, first.0),
+        &format!(
+            "{:.2} of the log-stretch there, {:.0e} with {}; auto {by_auto:.0e}; map {} there, {} with {}",
+            last.1,
+            first.1,
+            first.0,
+            decibels(pictures[0]),
+            decibels(pictures[1]),
+            first.0
+        ),
         "steps_too_long_for_a_shear_that_turns",
     ]);
 }
@@ -293,15 +319,18 @@ fn chaos_parts_single_from_double_precision() {
         let b: Vec<f64> = double.log_stretch_f64.iter().map(|&s| s / tau).collect();
         let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
         let drift = mean(&a) / mean(&b) - 1.0;
-        let picture = correlation(&blocks(&a, 40, 4), &blocks(&b, 40, 4));
+        let pixels = [&a, &b].map(|values| blocks(values, 40, 4));
+        let picture = correlation(&pixels[0], &pixels[1]);
         let recorded = measured(&source, &map(tau, (20.0 * tau) as usize, Precision::F32)).precision.unwrap();
-        found.push((tau, parted, correlation(&a, &b), drift, distribution_distance(&a, &b), picture, recorded));
+        let maps = map_psnr(&pixels[0], &pixels[1]);
+        found.push((tau, parted, correlation(&a, &b), drift, distribution_distance(&a, &b), picture, recorded, maps));
     }
-    for (tau, parted, correlation, drift, distance, picture, recorded) in &found {
+    for (tau, parted, correlation, drift, distance, picture, recorded, maps) in &found {
         let parted = 100.0 * parted;
         println!(
             "tau {tau}: {parted:.1} % parted, correlation {correlation:.4}, of 4x4 {picture:.4}, mean {drift:+.1e}, distribution {distance:.3}, \
-             recorded {recorded:.1e}"
+             recorded {recorded:.1e}, maps {}",
+            decibels(*maps)
         );
     }
     let parts = found.iter().find(|f| f.1 > 0.1).expect("paths part");
@@ -312,6 +341,7 @@ fn chaos_parts_single_from_double_precision() {
     assert!(last.1 > 0.5 && last.2 < 0.95, "points lose their value: {last:?}");
     // Two samples of 800 differ by 0.068 (Kolmogorov, 5 %) if they have the same distribution.
     assert!(found.iter().all(|f| f.3.abs() < 0.01 && f.4 < 0.068), "mean and distribution do not: {found:?}");
+    assert!(last.7 < found[0].7, "nor does the map keep its pixels: {found:?}");
     assert!(found[0].6 < TOLERANCE && found.iter().all(|f| f.1 < 0.01 || f.6 > TOLERANCE), "paths that part are warned of: {found:?}");
     let told = found.iter().find(|f| f.6 > TOLERANCE).expect("a warning");
     let warned = |tau: f64| {
@@ -335,12 +365,16 @@ fn chaos_parts_single_from_double_precision() {
             refused.map_or("-".into(), |t| t.to_string())
         ),
         &format!(
-            "at tau {}: correlation of single FTLEs {:.2}, of pixels of 16 rays {:.2}; the mean {:+.1} %, distributions {:.3} apart (Kolmogorov)",
+            "at tau {}: correlation of single FTLEs {:.2}, of pixels of 16 rays {:.2}; the mean {:+.1} %, distributions {:.3} apart (Kolmogorov); map of such \
+             pixels {}, at tau {} {}",
             last.0,
             last.2,
             last.5,
             100.0 * last.3,
-            last.4
+            last.4,
+            decibels(last.7),
+            parts.0,
+            decibels(parts.7)
         ),
         "chaos_parts_single_from_double_precision",
     ]);

@@ -2,13 +2,13 @@
 
 use crate::kit::scene;
 use crate::network_support::{DoubleGyre, rms, traced, uniform_points};
-use crate::sweep::{grid, lattice, map, row, window};
+use crate::sweep::{decibels, grid, lattice, map, map_psnr, row, window};
 use ridgewatch::field::{Domain, Snapshot, Window, WindowWarning};
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Precision, VelocitySource};
 use ridgewatch::publish::compare_films;
 use ridgewatch::run::{FrameRecord, RunOptions};
 use ridgewatch::surrogate::network::NetworkSettings;
-use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, Samples, SurrogateSettings, build};
+use ridgewatch::surrogate::{HostSurrogate, Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, build};
 use std::sync::Arc;
 
 fn settings(rate: Option<f32>) -> NetworkSettings {
@@ -37,6 +37,14 @@ fn size(samples: &Samples) -> f64 {
     crate::sweep::rms(samples.log_stretch.iter().map(|&s| f64::from(s)))
 }
 
+/// PSNR of a map that the network answers alone, one of these points a pixel.
+fn picture(network: &HostSurrogate, held_out: &Samples) -> f64 {
+    let mut predicted = vec![0.0; held_out.len()];
+    network.predict(&held_out.points, &mut predicted).unwrap();
+    let [found, exact] = [&predicted, &held_out.log_stretch].map(|values| values.iter().map(|&s| f64::from(s)).collect::<Vec<f64>>());
+    map_psnr(&found, &exact)
+}
+
 /// Fails without the roll-back of the weights.
 #[test]
 fn learning_rate_too_high() {
@@ -50,7 +58,7 @@ fn learning_rate_too_high() {
         let error = rms(&network, &held_out) / size(&held_out);
         println!("rate {rate}: {} roll-backs, {} steps lost, error {:.3} of the labels", learned.rollbacks, learned.lost_steps, error);
         assert!(error.is_finite() && error < 2.0, "rate {rate}: {error}");
-        found.push((rate, learned.rollbacks, learned.lost_steps, error));
+        found.push((rate, learned.rollbacks, learned.lost_steps, error, picture(&network, &held_out)));
     }
     let fails = found.iter().find(|f| f.1 > 0).expect("a rate diverges");
     let usual = found.iter().find(|f| f.0 == 1e-2).unwrap();
@@ -68,7 +76,15 @@ fn learning_rate_too_high() {
         &format!("rate {} (roll-backs in 400 steps: {}); the default is 0.01", fails.0, fails.1),
         "`training.rollbacks`, `training.lost_steps`, a warning",
         "goes back to the last good weights at half the rate",
-        &format!("{:.2} of the labels' size at that rate, {:.2} at 1, {:.2} at the default", fails.3, found[5].3, usual.3),
+        &format!(
+            "{:.2} of the labels' size at that rate (map {}), {:.2} at 1 ({}), {:.2} at the default ({})",
+            fails.3,
+            decibels(fails.4),
+            found[5].3,
+            decibels(found[5].4),
+            usual.3,
+            decibels(usual.4)
+        ),
         "learning_rate_too_high",
     ]);
 }
@@ -87,17 +103,23 @@ fn labels_without_a_value() {
         assert_eq!((learned.dropped, learned.rollbacks), (lost as u64, 0), "dropped and counted");
         let error = rms(&network, &held_out) / size(&held_out);
         assert!(error.is_finite());
-        found.push((share, error));
+        found.push((share, error, picture(&network, &held_out)));
     }
     println!("{found:?}");
     let fails = found.iter().find(|f| f.1 > 2.0 * found[0].1).expect("too few labels remain");
-    assert!(fails.0 >= 0.5, "half of the labels suffice: {found:?}");
+    assert!(fails.0 >= 0.5 && fails.2 < found[0].2, "half of the labels suffice: {found:?}");
     row([
         "labels without a value (NaN)",
         &format!("{:.0} % of the labels lost (error {:.1} times as large)", 100.0 * fails.0, fails.1 / found[0].1),
         "`training.dropped`",
         "drops and counts them; the others train as before",
-        &format!("{:.2} of the labels' size with all of them, {:.2} there", found[0].1, fails.1),
+        &format!(
+            "{:.2} of the labels' size with all of them (map {}), {:.2} there ({})",
+            found[0].1,
+            decibels(found[0].2),
+            fails.1,
+            decibels(fails.2)
+        ),
         "labels_without_a_value",
     ]);
 }
@@ -267,7 +289,7 @@ fn too_few_audit_points() {
              trust.audit_min_per_cell = 1\ntrust.audit_max_per_cell = 1\ntrust.audit_share = {share}"
         );
         let options = RunOptions { verify_points: 20_000, ..RunOptions::default() };
-        let (mut held, mut frames, mut width, mut points) = (0, 0, 0.0, 0.0);
+        let (mut held, mut frames, mut width, mut points, mut errs) = (0, 0, 0.0, 0.0, 0.0);
         scene::run_frames(scene::setup(&scene::double_gyre([32, 16, 2], &keys), &[]), &options, |frame| {
             let record = &frame.record;
             assert!(record.audited as f64 >= share * record.queries as f64, "{} points for {} queries", record.audited, record.queries);
@@ -275,6 +297,7 @@ fn too_few_audit_points() {
             let [low, high] = stated.optical_rms_interval;
             held += u32::from((low..=high).contains(&verified.optical_rms));
             width += (high - low) / verified.optical_rms;
+            errs += verified.optical_rms;
             points += record.audited as f64;
             frames += 1;
         });
@@ -284,7 +307,7 @@ fn too_few_audit_points() {
             points / f64::from(frames),
             width / f64::from(frames)
         );
-        found.push((share, points / f64::from(frames), width / f64::from(frames), held, frames));
+        found.push((share, points / f64::from(frames), width / f64::from(frames), held, frames, errs / f64::from(frames)));
     }
     let fails = found.iter().find(|f| f.2 > 1.0).unwrap_or(&found[found.len() - 1]);
     assert!(found[4].2 > 3.0 * found[0].2, "fewer points say less: {found:?}");
@@ -293,7 +316,10 @@ fn too_few_audit_points() {
         &format!("{:.0} points (interval {:.1} times as wide as the value)", fails.1, fails.2),
         "`trusted_error.optical_rms_interval`, `audited`",
         "traces `trust.audit_share` of all queries, whatever the gate says, and more until the standard error is a tenth (`audit_precision`)",
-        &format!("{:.0} points: {:.2} times as wide, {} of {} intervals hold", found[0].1, found[0].2, found[0].3, found[0].4),
+        &format!(
+            "{:.3} of the ramp where trusted; {:.0} points: {:.2} times as wide, {} of {} intervals hold",
+            fails.5, found[0].1, found[0].2, found[0].3, found[0].4
+        ),
         "too_few_audit_points",
     ]);
 }

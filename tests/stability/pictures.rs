@@ -412,7 +412,7 @@ fn too_few_pairs_for_an_interval() {
     // No first picture takes fewer than one pair a tile.
     for pairs in [1024, 256, 64, 16, 4] {
         let samples = 2.0 * f64::from(pairs) / (WIDTH * WIDTH) as f64;
-        let (mut known, mut inside, mut width, mut silent) = (0, 0, 0.0, 0);
+        let (mut known, mut inside, mut width, mut silent, mut errs) = (0, 0, 0.0, 0, 0.0);
         for seed in 0..SEEDS {
             let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
             let round = corrected(&surrogate, samples);
@@ -424,6 +424,7 @@ fn too_few_pairs_for_an_interval() {
             known += 1;
             inside += u32::from((error.rms.low..=error.rms.high).contains(&exact));
             width += (error.rms.high - error.rms.low) / exact;
+            errs += exact;
             // One pair a tile is in one quarter, and may show no difference.
             silent += u32::from(error.rms.value <= 1.001 * error.march_rms);
             assert!(pairs > 4 || error.rms.high > 1.5 * error.rms.low, "{:?}", error.rms);
@@ -432,7 +433,7 @@ fn too_few_pairs_for_an_interval() {
             "{pairs} pairs: {known} of {SEEDS} known, {inside} inside, width {:.2}, {silent} show no difference",
             width / f64::from(known)
         );
-        found.push((pairs, known, inside, width / f64::from(known), silent));
+        found.push((pairs, known, inside, width / f64::from(known), silent, errs / f64::from(known)));
     }
     let last = found[found.len() - 1];
     // Of 24 intervals of 95 %, 20 or more hold with a probability of 0.99.
@@ -446,8 +447,8 @@ fn too_few_pairs_for_an_interval() {
         "`picture_error`, its interval; `samples_per_pixel`",
         "takes Student's quantile for the number of tiles, and at least the rule of three",
         &format!(
-            "interval {:.1} times as wide as the error; {:.1} times with {} pairs; with {} pairs {} of {} pictures show no difference",
-            last.3, found[0].3, found[0].0, last.0, last.4, last.1
+            "interval {:.1} times as wide as the error, {:.4} rms; {:.1} times with {} pairs, {:.4}; with {} pairs {} of {} pictures show no difference",
+            last.3, last.5, found[0].3, found[0].0, found[0].5, last.0, last.4, last.1
         ),
         "too_few_pairs_for_an_interval",
     ]);

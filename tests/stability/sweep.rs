@@ -4,6 +4,8 @@ use crate::kit::flow::trace;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::field::{DomainPoint, UnitPoint, analytic::Analytic};
 use ridgewatch::flow::{Extras, FlowMap, Integrator, Precision, VelocitySource};
+use ridgewatch::publish::compare_films;
+use ridgewatch::render::{Film, MAP_TONE, map_radiance, map_range};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
@@ -38,6 +40,27 @@ pub fn rms(values: impl IntoIterator<Item = f64>) -> f64 {
 pub fn rms_difference(a: &[f64], b: &[f64]) -> f64 {
     let found = rms(a.iter().zip(b).map(|(a, b)| a - b));
     if found.is_nan() { f64::INFINITY } else { found }
+}
+
+/// PSNR, in decibels, of the map that a run draws of these log-stretches, one a pixel, beside that of the exact ones and in its colours. Infinite if no
+/// pixel differs.
+pub fn map_psnr(found: &[f64], exact: &[f64]) -> f64 {
+    let [low, high] = map_range(exact.iter().map(|&stretch| stretch as f32), false);
+    let map = |stretches: &[f64]| {
+        let mut film = Film::new(stretches.len(), 1);
+        for (pixel, stretch) in film.rgba.iter_mut().zip(stretches) {
+            // What has no value is drawn black.
+            let [r, g, b] = if stretch.is_finite() { map_radiance((stretch - low) / (high - low)) } else { [0.0; 3] };
+            *pixel = [r, g, b, 1.0];
+        }
+        film
+    };
+    compare_films(&map(found), &map(exact), MAP_TONE).unwrap().psnr.unwrap_or(f64::INFINITY)
+}
+
+/// A PSNR in words.
+pub fn decibels(psnr: f64) -> String {
+    if psnr.is_finite() { format!("{psnr:.1} dB") } else { "no difference".to_owned() }
 }
 
 /// Midpoints of a lattice over a domain, in the plane.
