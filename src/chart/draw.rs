@@ -140,7 +140,16 @@ fn panels(chart: &Chart) -> Vec<Panel> {
     }
     panels.extend(chart.pictures.as_ref().filter(|panel| !panel.curves.is_empty()).map(picture_panel));
     panels.extend(chart.pictures.as_ref().and_then(sliding_panel));
-    panels.extend(chart.scaling.as_ref().and_then(|panel| scaling_panel(panel, &chart.time_unit)));
+    if let Some(panel) = &chart.scaling {
+        let tau = if chart.time_unit.is_empty() { "tau".to_owned() } else { format!("tau, {}", chart.time_unit) };
+        let axes = [
+            ("tau", "tau", tau.as_str()),
+            ("snapshots", "snapshots in tau", "snapshots"),
+            ("nodes", "nodes of the grid", "nodes"),
+            ("threads", "threads", "threads"),
+        ];
+        panels.extend(axes.into_iter().filter_map(|(axis, against, label)| scaling_panel(panel, axis, against, label)));
+    }
     panels
 }
 
@@ -204,20 +213,21 @@ fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
     })
 }
 
-/// Costs against tau; the other axes are in the verdict and in the CSV.
-fn scaling_panel(panel: &ScalingPanel, time_unit: &str) -> Option<Panel> {
-    let along: Vec<_> = panel.points.iter().filter(|point| point.axis == "tau").collect();
+/// Costs along one axis; `None` with fewer than two points on it.
+fn scaling_panel(panel: &ScalingPanel, axis: &str, against: &str, label: &str) -> Option<Panel> {
+    let mut along: Vec<_> = panel.points.iter().filter(|point| point.axis == axis).collect();
     if along.len() < 2 {
         return None;
     }
+    along.sort_by(|a, b| a.value.total_cmp(&b.value));
     let series = |name: &str, value: &dyn Fn(&super::ScalingPoint) -> f64| Series {
         name: name.into(),
         points: along.iter().map(|point| (point.value, value(point))).collect(),
         is_line: true,
     };
     Some(Panel {
-        title: "Cost of a sample against tau, steps by error".into(),
-        x: if time_unit.is_empty() { "tau".into() } else { format!("tau, {time_unit}") },
+        title: format!("Cost of a sample against {against}, steps by error"),
+        x: label.into(),
         y: "nanoseconds per sample".into(),
         is_y_log: true,
         series: vec![series("tracing", &|point| point.trace_ns), series("table (built)", &|point| point.table_ns)],

@@ -6,6 +6,7 @@ use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, DeviceError, Surrogate as _, SurrogateRequest};
+use crate::field::Window;
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer, VelocitySource};
 use crate::run::RunError;
 use crate::source::SourceKind;
@@ -20,6 +21,8 @@ use std::time::Instant;
 const BATCH: [usize; 2] = [1 << 16, 1 << 21];
 /// Points on which windows are compared.
 const COMPARED: usize = 1 << 13;
+/// Most bytes of a window of turbulence on finer grids, which is made for the chart alone.
+const MOST_MADE: usize = 1 << 28;
 
 /// Costs at one size of the task.
 #[derive(Debug, Clone, Serialize)]
@@ -38,7 +41,7 @@ pub struct ScalingPoint {
     pub table_seconds: f64,
     /// Samples from which on the table is cheaper, its tracing included; `None` if it never is.
     pub table_pays_from: Option<f64>,
-    /// Of `snapshots`: root mean square difference of the FTLE from that of all of them, 1/time.
+    /// Of `snapshots`, and of `nodes` of one flow: root mean square difference of the FTLE from that of all of them, 1/time. `None` for all of them.
     pub rms: Option<f64>,
 }
 
@@ -55,10 +58,17 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
     let tau = opened.plan.map.tau;
     // A window of snapshots ends after tau.
     let longest: &[f64] = if opened.shape().is_none() { &[0.25, 0.5, 1.0, 2.0] } else { &[0.25, 0.5, 1.0] };
+    let mut whole = None;
     for factor in longest {
         let map = FlowMap { tau: tau * factor, ..opened.plan.map.clone() };
-        points.extend(point(charting, opened, &map, "tau", tau * factor)?);
+        let measured = point(charting, opened, &map, "tau", tau * factor)?;
+        if *factor == 1.0 {
+            whole.clone_from(&measured);
+        }
+        points.extend(measured);
     }
+    // The scene as it is, on the other axes.
+    let at = |axis, value| whole.clone().map(|point| ScalingPoint { axis, value, ..point });
     if let VelocitySource::Window(window) = &opened.slide.velocity {
         let count = window.snapshots().len();
         for stride in [4, 2].into_iter().filter(|stride| 2 * stride < count) {
@@ -68,16 +78,14 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
             let rms = Some(charting.pool.install(|| difference(opened, &other))?);
             points.extend(point(charting, &other, &opened.plan.map, "snapshots", snapshots)?.map(|point| ScalingPoint { rms, ..point }));
         }
-    }
-    if let (SourceKind::Turbulence, Some(nodes)) = (charting.settings.source.kind, opened.shape()) {
-        for factor in [0.5, 0.25] {
-            let mut settings = charting.settings.clone();
-            let fewer = nodes.map(|n| ((n as f64 * factor) as usize).max(4));
-            settings.source.nodes = Some(fewer);
-            let other = Opened::new(&settings, charting.device, &FirstSlides::read(&settings, 1, charting.stop)?)?;
-            points.extend(point(charting, &other, &opened.plan.map, "nodes", fewer.iter().product::<usize>() as f64)?);
+        points.extend(at("snapshots", count as f64));
+        let nodes = opened.shape().unwrap_or([1; 3]);
+        if charting.settings.source.kind == SourceKind::Turbulence {
+            of_turbulence(charting, opened, nodes, count, &mut points)?;
+        } else {
+            of_coarser(charting, opened, window, &mut points)?;
         }
-        points.extend(point(charting, opened, &opened.plan.map, "nodes", nodes.iter().product::<usize>() as f64)?);
+        points.extend(at("nodes", nodes.iter().product::<usize>() as f64));
     }
     if !charting.device.is_gpu() {
         let all = charting.pool.current_num_threads();
@@ -91,6 +99,44 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
         }
     }
     Ok(ScalingPanel { points })
+}
+
+/// Turbulence on coarser and finer grids. Each is another flow, whose particles cross as many cells.
+fn of_turbulence(
+    charting: &mut Charting<'_>,
+    opened: &Opened,
+    nodes: [usize; 3],
+    snapshots: usize,
+    points: &mut Vec<ScalingPoint>,
+) -> Result<(), RunError> {
+    for factor in [0.25, 0.5, 2.0] {
+        let other = nodes.map(|n| ((n as f64 * factor) as usize).max(4));
+        let count = other.iter().product::<usize>();
+        if factor > 1.0 && count.saturating_mul(snapshots * size_of::<[f32; 4]>()) > MOST_MADE {
+            continue;
+        }
+        let mut settings = charting.settings.clone();
+        settings.source.nodes = Some(other);
+        let other = Opened::new(&settings, charting.device, &FirstSlides::read(&settings, 1, charting.stop)?)?;
+        points.extend(point(charting, &other, &opened.plan.map, "nodes", count as f64)?);
+    }
+    Ok(())
+}
+
+/// The same flow with every fourth and every second node along each axis.
+fn of_coarser(charting: &mut Charting<'_>, opened: &Opened, window: &Window, points: &mut Vec<ScalingPoint>) -> Result<(), RunError> {
+    for stride in [4, 2] {
+        let coarser = window.coarsened(stride);
+        let Some(grid) = coarser.grid().cloned().filter(|grid| Some(grid.shape()) != opened.shape()) else { continue };
+        let mut pair = [opened.over(opened.slide.velocity.clone()), opened.over(VelocitySource::Window(Arc::new(coarser)))];
+        // Nodes that are left out may lie at an edge.
+        pair.iter_mut().for_each(|opened| opened.plan.domain = grid.domain());
+        let [whole, other] = pair;
+        let rms = Some(charting.pool.install(|| difference(&whole, &other))?);
+        let measured = point(charting, &other, &opened.plan.map, "nodes", grid.nodes() as f64)?;
+        points.extend(measured.map(|point| ScalingPoint { rms, ..point }));
+    }
+    Ok(())
 }
 
 /// Root mean square difference of the FTLE in two windows, with as many steps, where both have one.

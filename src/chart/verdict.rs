@@ -22,7 +22,7 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             Some(samples) => format!("the table pays from {samples:.1e} samples on"),
             None => "the table never pays".into(),
         };
-        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all snapshots."));
+        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all {}.", point.axis));
         said.push(format!(
             "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
             point.axis,

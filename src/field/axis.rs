@@ -81,6 +81,12 @@ impl Axis {
         self
     }
 
+    /// The axis with every `stride`-th of its nodes, from the first on.
+    pub(super) fn thinned(&self, stride: usize) -> Self {
+        let coordinates = self.coordinates.iter().copied().step_by(stride).collect();
+        Self { coordinates, uniform_step: self.uniform_step.map(|step| step * stride as f64), ..self.clone() }
+    }
+
     /// Name in the source, e.g. `longitude`.
     pub fn name(&self) -> &str {
         &self.name

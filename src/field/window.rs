@@ -1,6 +1,6 @@
 //! The sliding window: exactly the snapshots that an integration over [t0, t0 + tau] needs.
 
-use super::{Geometry, Grid, Snapshot};
+use super::{Axis, Geometry, Grid, Snapshot};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use thiserror::Error;
@@ -202,6 +202,30 @@ impl Window {
         thinned
     }
 
+    /// A window of every `stride`-th node along each axis, of those axes that have at least four of them left. A periodic axis keeps its nodes unless it
+    /// has a multiple of `stride`, since its cells would differ.
+    pub fn coarsened(&self, stride: usize) -> Self {
+        let mut coarsened = Self::new(self.span);
+        let Some(fine) = self.grid() else { return coarsened };
+        let stride = stride.max(1);
+        let is_coarsened = |axis: &Axis| axis.len().div_ceil(stride) >= 4 && (axis.period().is_none() || axis.len().is_multiple_of(stride));
+        let strides: [usize; 3] = std::array::from_fn(|k| fine.axes.get(k).filter(|axis| is_coarsened(axis)).map_or(1, |_| stride));
+        let axes = fine.axes.iter().zip(strides).map(|(axis, stride)| axis.thinned(stride)).collect();
+        let grid = Arc::new(Grid { axes, ..(**fine).clone() });
+        let ([nx, ny, _], shape) = (fine.shape(), grid.shape());
+        for snapshot in &self.snapshots {
+            let node = |i: usize| {
+                let [x, y, z] = [i % shape[0], i / shape[0] % shape[1], i / shape[0] / shape[1]];
+                snapshot.nodes[(z * strides[2] * ny + y * strides[1]) * nx + x * strides[0]]
+            };
+            let nodes = (0..grid.nodes()).map(node).collect();
+            // Times of a window ascend.
+            let pushed = coarsened.push(Arc::new(Snapshot::new(snapshot.time, grid.clone(), nodes)));
+            debug_assert!(pushed.is_ok());
+        }
+        coarsened
+    }
+
     /// Whether all levels (nodes of the third axis, two or more) have the same velocity in every snapshot, and none across them.
     pub fn is_flat(&self) -> bool {
         let Some(grid) = self.grid() else { return false };
@@ -226,7 +250,6 @@ impl Window {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Axis;
 
     fn grid(nodes: usize) -> Arc<Grid> {
         let axis = |name| Axis::uniform(name, "m", 0.0, 1.0, nodes).unwrap();
@@ -260,6 +283,34 @@ mod tests {
             };
             assert!(!flat(5, &odd), "{time} {i} {component}");
         }
+    }
+
+    #[test]
+    fn a_coarser_window_has_the_same_velocities_at_its_nodes() {
+        let axis = |name, nodes| Axis::uniform(name, "m", 0.0, (nodes - 1) as f64, nodes).unwrap();
+        let levels = Axis::new("z", "m", vec![0.0, 1.0, 3.0]).unwrap();
+        // Eight columns that close a circle, nine rows, and too few levels to leave any out.
+        let grid = Arc::new(Grid {
+            axes: vec![axis("x", 8).with_period(8.0), axis("y", 9), levels],
+            geometry: Geometry::Cartesian,
+            slab: (0.0, 1.0),
+        });
+        let mut window = Window::new(1.0);
+        for time in [0.0, 1.0] {
+            // Each node's velocity is its place.
+            let of = |divisor: usize, count: usize| (0..grid.nodes()).map(|i| (i / divisor % count) as f32).collect::<Vec<f32>>();
+            window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &of(1, 8), &of(8, 9), &of(72, 3)))).unwrap();
+        }
+        let coarser = window.coarsened(2);
+        let grid = coarser.grid().unwrap();
+        assert_eq!((grid.shape(), grid.axes[0].period(), coarser.snapshots().len()), ([4, 5, 3], Some(8.0), 2));
+        assert_eq!(grid.domain(), window.grid().unwrap().domain());
+        for (i, node) in coarser.snapshots().flat_map(|snapshot| snapshot.nodes.iter().enumerate()) {
+            assert_eq!(node[..3], [(i % 4 * 2) as f32, (i / 4 % 5 * 2) as f32, (i / 20) as f32]);
+        }
+        // Columns that do not close the circle stay, and so do rows of which three would be left.
+        assert_eq!(window.coarsened(3).grid().unwrap().shape(), [8, 9, 3]);
+        assert_eq!(window.coarsened(1).grid(), window.grid());
     }
 
     fn at(time: f64, grid: &Arc<Grid>) -> Arc<Snapshot> {

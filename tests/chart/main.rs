@@ -132,9 +132,16 @@ fn the_error_of_fewer_snapshots_falls_with_their_number() {
     run(&mut ridgewatch(given.into_iter().chain(keys))).success();
     let chart = json(&out.join("chart.json"));
     let points = chart["scaling"]["points"].as_array().unwrap();
-    let found: Vec<(f64, f64)> =
-        points.iter().filter(|point| point["axis"] == "snapshots").map(|point| (number(&point["value"]), number(&point["rms"]))).collect();
-    assert_eq!(found.iter().map(|(count, _)| *count).collect::<Vec<_>>(), [4.0, 7.0], "{:?}", chart["not_measured"]);
+    let of = |axis: &str| points.iter().filter(|point| point["axis"] == axis).cloned().collect::<Vec<Value>>();
+    let values = |axis: &str| of(axis).iter().map(|point| number(&point["value"])).collect::<Vec<_>>();
+    assert_eq!(values("snapshots"), [4.0, 7.0, 12.0], "{:?}", chart["not_measured"]);
+    // A quarter, half and twice as many nodes along each axis, and those of the scene.
+    assert_eq!(values("nodes"), [8 * 4 * 4, 16 * 8 * 8, 64 * 32 * 32, 32 * 16 * 16].map(f64::from), "{:?}", chart["not_measured"]);
+    let found: Vec<(f64, f64)> = of("snapshots")[..2].iter().map(|point| (number(&point["value"]), number(&point["rms"]))).collect();
+    let svg = std::fs::read_to_string(out.join("chart.svg")).unwrap();
+    for against in ["tau", "snapshots in tau", "nodes of the grid"] {
+        assert!(svg.contains(&format!("Cost of a sample against {against}, steps by error")), "{against}");
+    }
     assert!(found[1].1 > 0.0 && found[1].1 < 0.7 * found[0].1, "{found:?}");
     assert!(chart["verdict"].to_string().contains("rms from that of all snapshots"), "{}", chart["verdict"]);
 }
