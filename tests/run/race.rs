@@ -32,7 +32,7 @@ fn the_method_that_wins_draws_and_the_next_run_knows() {
     let folder = tempfile::tempdir().unwrap();
     let [scene, first, second, picture] = ["gyre.toml", "first", "second", "picture.png"].map(|name| folder.path().join(name));
     std::fs::copy(config("double_gyre.toml"), &scene).unwrap();
-    auto("replay", &scene, &first, &["time.slides=400", "time.frames_per_slide=1"]);
+    auto("replay", &scene, &first, &["time.slides=600", "time.frames_per_slide=1"]);
     let (drawn, report) = (records(&first), summary(&first));
     let (race, decisions) = (&report["run"]["race"], report["run"]["decisions"].as_array().unwrap());
     let slide = race["slide"].as_u64().unwrap();
