@@ -17,6 +17,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+/// Fewest steps of an epoch, if the scene leaves the batch of a GPU open.
+const LEAST_STEPS: usize = 64;
+/// Smallest batch that a scene may give.
+const MIN_BATCH: usize = 64;
+
 /// How long a network is trained, and on what.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainOptions {
@@ -93,6 +98,13 @@ pub fn train(
     let mut decisions = Vec::new();
     if let Some(shape) = opened.shape().filter(|_| device.is_gpu()) {
         settings.network = suited_network(&settings.network, shape, &mut decisions);
+        // A run draws labels without an end; here they are given.
+        let most = 1 << (options.labels / LEAST_STEPS).max(MIN_BATCH).ilog2();
+        if settings.network.gpu_batch.is_some_and(|batch| batch > most) {
+            settings.network.gpu_batch = Some(most);
+            let why = format_args!("at least {LEAST_STEPS} steps an epoch of {} labels", options.labels);
+            Decision::new("network.batch", most, why).enter(&mut decisions);
+        }
     }
     let training = Training { settings: &settings, options, opened: &opened, stop };
     pool.install(|| match device {
@@ -121,7 +133,7 @@ impl Training<'_> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         let extras = settings.network.label_extras();
         let began = Instant::now();
-        // In parts, which tell how far they are; the labels are traced whole.
+        // In parts, which tell how far they are; never stopped early.
         let never = AtomicBool::new(false);
         let in_parts = Interruptible::new(&tracer, &never);
         let labels =
@@ -141,11 +153,11 @@ impl Training<'_> {
         let mut surrogate = backend.surrogate(&request, &tracer).map_err(failed)?;
         let buffer = ReplayBuffer::holding(&labels);
         let on_device = surrogate.trains_on_device();
+        let mut network = settings.network.clone();
         if !on_device {
-            // Taken by the trainer as well.
-            cpu_batch(&mut settings.network.clone(), &mut decisions);
+            cpu_batch(&mut network, &mut decisions);
         }
-        let steps_per_epoch = (labels.len() / settings.network.batch_on(on_device)).max(1) as u64;
+        let steps_per_epoch = (labels.len() / network.batch_on(on_device)).max(1) as u64;
         let (bytes, device) = (surrogate.bytes(), backend.name());
         let mut report = TrainReport { epochs: Vec::new(), label_seconds, bytes, device, decisions, interrupted: false };
         let (mut steps, mut seconds, mut rollbacks) = (0, 0.0, 0);

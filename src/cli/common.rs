@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{Race, RunError, Settings, Setup, why_steps};
+use ridgewatch::run::{MapSettings, Race, RunError, Settings, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -185,7 +185,8 @@ pub fn text_with_tau(scene: &SceneFile, setup: &Setup, text: String) -> Result<S
 
 /// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
 pub fn open(scene: &SceneFile) -> Result<Setup> {
-    open_by(scene, Setup::new)
+    // Maps of the slides are those of runs.
+    open_by(scene, |settings| Setup::new(Settings { maps: MapSettings::default(), ..settings }))
 }
 
 /// The same by [`Setup::new`] or [`Setup::following`].

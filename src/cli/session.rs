@@ -357,7 +357,7 @@ fn work(
                         notes.iter().for_each(|text| bar.suspend(|| messages::note(text)));
                         match drawn {
                             Drawn::Map(map) => output.map(map),
-                            Drawn::TooSlow => output.no_map(),
+                            Drawn::TooSlow | Drawn::Apart => output.no_map(),
                             Drawn::TooEarly => {}
                         }
                     }

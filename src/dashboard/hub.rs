@@ -15,6 +15,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 
+/// A run that leaves no mark of progress for so long may hang. Work on a GPU leaves them between its parts.
+const HANGS: Duration = Duration::from_secs(60);
 /// Maximum length of a published message, in bytes: a lossless picture of 16 million pixels.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Maximum length of a picture that is shown, in bytes. Some proxies accept 10 MB.
@@ -82,6 +84,8 @@ struct Health {
     last_record: Option<Instant>,
     intervals: VecDeque<Duration>,
     is_connected: bool,
+    /// Marks of progress of the run, and when there was a new one.
+    marks: Option<(u64, Instant)>,
     /// Why the publisher cannot be followed.
     link_problem: Option<String>,
     /// Why pictures or records cannot be shown.
@@ -341,14 +345,15 @@ impl Hub {
     /// Message about the publisher, to a page that may steer if there is a token to share.
     pub fn state(&self, token_to_share: Option<&str>) -> Bytes {
         let clients = lock(&self.clients).there.len();
-        let health = lock(&self.health);
+        let mut health = lock(&self.health);
         let silence = health.last_message.map(|last| last.elapsed());
+        let is_at_work = self.is_beside_run && health.has_new_marks(progress::marks());
         let work = if self.is_beside_run { progress::work().map(|words| short(&words)) } else { None };
         let state = State {
             kind: "state",
             endpoint: &self.endpoint,
-            // A run at work is not lost.
-            status: if work.is_some() { health.status(silence).unless_silent() } else { health.status(silence) },
+            // A run at work is not lost, unless it hangs.
+            status: if work.is_some() && is_at_work { health.status(silence).unless_silent() } else { health.status(silence) },
             seconds_since_message: silence.map(|silence| silence.as_secs_f64()),
             work,
             clients,
@@ -364,6 +369,16 @@ impl Hub {
 }
 
 impl Health {
+    /// Whether the run left marks within the last while.
+    fn has_new_marks(&mut self, marks: u64) -> bool {
+        let (_, since) = *self.marks.get_or_insert((marks, Instant::now()));
+        if self.marks.is_some_and(|(before, _)| before != marks) {
+            self.marks = Some((marks, Instant::now()));
+            return true;
+        }
+        since.elapsed() < HANGS
+    }
+
     /// Another run may have other intervals.
     fn connected(&mut self) {
         (self.is_connected, self.link_problem, self.last_record) = (true, None, None);

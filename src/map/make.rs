@@ -121,7 +121,7 @@ pub fn make(
                 let kind = structures(direction);
                 let found = smoothing::roughness(&field.values, &size);
                 let panel = if panels > 1 { format!("{} FTLE, tau = {tau}: ", direction.name()) } else { String::new() };
-                notes.extend(too_coarse(found, "--ridge-grid").map(|text| panel + &text));
+                notes.extend(too_coarse(found, "grid (`map --ridge-grid`)").map(|text| panel + &text));
                 let strength = strength.over(&field, nodes_in_cell(&moment.velocity, size));
                 found_by = Some((found, strength));
                 ridges = field.ridges(&strength).into_iter().map(|points| RidgeLine { kind, tau, points }).collect();

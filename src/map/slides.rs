@@ -9,7 +9,7 @@ use super::sheet::plot_error;
 use super::view::LARGEST;
 use super::{MapError, Moment};
 use crate::backend::Device;
-use crate::field::Window;
+use crate::field::{Snapshot, Window};
 use crate::flow::{Direction, FlowMap, VelocitySource};
 use crate::progress::Work;
 use crate::publish::SlideMap;
@@ -31,12 +31,14 @@ pub struct SlideMaps {
     device: Device,
     /// Range of the colours, of the first slide since tau or direction was steered, so that maps of a run compare.
     range: Option<(f64, Direction, [f64; 2])>,
-    /// Remarks made so far; they are few.
+    /// Remarks made so far, without their numbers, which differ from slide to slide.
     told: HashSet<String>,
     /// The snapshots over twice tau so far, if maps show both directions.
     past: Window,
     /// Dates of the slides that these snapshots cover.
     dates: Vec<(f64, Option<String>)>,
+    /// True from windows that have no snapshot in common on, until twice tau is known again.
+    is_apart: bool,
     pace: Pace,
 }
 
@@ -46,8 +48,10 @@ pub enum Drawn {
     Map(SlideMap),
     /// The next window of a simulation was complete, and the map would have taken too long.
     TooSlow,
-    /// Both directions are to be shown, and less than twice tau is known.
+    /// Both directions are to be shown, and less than twice tau is known yet.
     TooEarly,
+    /// The same after windows that have no snapshot in common.
+    Apart,
 }
 
 impl SlideMaps {
@@ -61,6 +65,7 @@ impl SlideMaps {
             told: HashSet::new(),
             past: Window::new(2.0 * plan.map.tau),
             dates: Vec::new(),
+            is_apart: false,
             // A simulation may wait until each of its steps is in a slide.
             pace: Pace::new(if live.follow == Follow::Every { 0.0 } else { SHARE }),
         })
@@ -75,7 +80,14 @@ impl SlideMaps {
         let ShownSlide { slide, map, next, .. } = shown;
         let (index, tau, direction) = (slide.index, map.tau, map.direction);
         let Some(moment) = self.moment(slide, map) else {
-            return Ok((Drawn::TooEarly, self.untold(["maps of both directions begin when twice tau of snapshots are known".to_owned()])));
+            let (drawn, text) = match self.is_apart {
+                false => (Drawn::TooEarly, "maps of both directions begin when twice tau of snapshots are known"),
+                true => (
+                    Drawn::Apart,
+                    "windows of two slides have no snapshot in common: maps of both directions wait until twice tau is known again (maps_dropped)",
+                ),
+            };
+            return Ok((drawn, self.untold([text.to_owned()])));
         };
         let (scene, shown) = (&self.plan.scene, &self.plan.scene.maps);
         let options = MapOptions {
@@ -115,7 +127,8 @@ impl SlideMaps {
 
     /// The remarks that were not made before.
     fn untold(&mut self, notes: impl IntoIterator<Item = String>) -> Vec<String> {
-        notes.into_iter().filter(|note| self.told.insert(note.clone())).collect()
+        let kind = |note: &String| note.replace(|letter: char| letter.is_ascii_digit(), "");
+        notes.into_iter().filter(|note| self.told.insert(kind(note))).collect()
     }
 
     /// What the map of a slide shows; `None` as long as both directions are to be shown and less than twice tau is known.
@@ -123,13 +136,16 @@ impl SlideMaps {
         let (tau, plan) = (map.tau, Plan { map, ..self.plan.clone() });
         let Slide { mut velocity, mut time, mut date, .. } = slide;
         if let (true, VelocitySource::Window(window)) = (self.plan.scene.maps.both, &velocity) {
+            let before = self.past.oldest();
             self.past = joined(&self.past, window, 2.0 * tau);
+            self.is_apart |= before.is_some() && self.past.oldest() == window.oldest();
             self.dates.push((time, date));
             let oldest = self.past.oldest()?;
             self.dates.retain(|(time, _)| *time >= oldest);
             if !self.past.is_full() {
                 return None;
             }
+            self.is_apart = false;
             time = seed_of_both(&self.past, tau)?;
             date = self.dates.iter().find(|(known, _)| *known == time).and_then(|(_, date)| date.clone());
             velocity = VelocitySource::Window(Arc::new(self.past.clone()));
@@ -138,14 +154,14 @@ impl SlideMaps {
     }
 }
 
-/// The snapshots of a window and those before it, over `span`. After a gap in time, those of the window alone.
+/// The snapshots of a window and those before it, over `span`. Without a snapshot in common, after a gap or if the simulation was set back, those of
+/// the window alone.
 fn joined(past: &Window, window: &Window, span: f64) -> Window {
     let mut all = Window::new(span);
-    let Some(oldest) = window.oldest() else { return all };
-    let joins = past.newest().is_some_and(|newest| newest >= oldest);
-    let before = past.snapshots().filter(|snapshot| joins && snapshot.time < oldest);
-    for snapshot in before.chain(window.snapshots()) {
-        // In order of time and of one grid, as in their windows. After a restart on other coordinates the window remains.
+    let is_first = |snapshot: &&Arc<Snapshot>| window.snapshots().next().is_some_and(|first| Arc::ptr_eq(first, snapshot));
+    let before = past.snapshots().position(|snapshot| is_first(&snapshot)).unwrap_or(0);
+    for snapshot in past.snapshots().take(before).chain(window.snapshots()) {
+        // In order of time and of one grid, as in their windows.
         let _ = all.push(Arc::clone(snapshot));
     }
     all
@@ -218,13 +234,17 @@ mod tests {
     use super::*;
     use crate::field::{Axis, Geometry, Grid, analytic::Analytic};
 
-    /// Snapshots at these times.
-    fn window(times: std::ops::RangeInclusive<u32>, span: f64) -> Window {
+    /// Snapshots of a run, one at each whole time.
+    fn snapshots() -> Vec<Arc<Snapshot>> {
         let axes = ["x", "y"].map(|name| Axis::uniform(name, "1", 0.0, 1.0, 2).unwrap());
         let grid = Arc::new(Grid { axes: axes.to_vec(), geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
-        let mut window = Window::new(span);
-        for time in times {
-            window.push(Arc::new(Analytic::Saddle { rate: 1.0 }.snapshot(f64::from(time), &grid))).unwrap();
+        (0..12).map(|time| Arc::new(Analytic::Saddle { rate: 1.0 }.snapshot(f64::from(time), &grid))).collect()
+    }
+
+    fn window(of: &[Arc<Snapshot>]) -> Window {
+        let mut window = Window::new(2.0);
+        for snapshot in of {
+            window.push(snapshot.clone()).unwrap();
         }
         window
     }
@@ -232,17 +252,19 @@ mod tests {
     #[test]
     fn windows_join_to_one_over_twice_tau_but_not_over_a_gap() {
         let times = |window: &Window| window.snapshots().map(|snapshot| snapshot.time).collect::<Vec<_>>();
-        let mut past = joined(&Window::new(4.0), &window(0..=2, 2.0), 4.0);
+        let run = snapshots();
+        let mut past = joined(&Window::new(4.0), &window(&run[..3]), 4.0);
         assert!(times(&past) == [0.0, 1.0, 2.0] && !past.is_full());
         for newest in 3..=6 {
-            past = joined(&past, &window(newest - 2..=newest, 2.0), 4.0);
+            past = joined(&past, &window(&run[newest - 2..=newest]), 4.0);
         }
         assert!(times(&past) == [2.0, 3.0, 4.0, 5.0, 6.0] && past.is_full());
         assert_eq!(seed_of_both(&past, 2.0), Some(4.0));
-        let apart = joined(&past, &window(8..=10, 2.0), 4.0);
+        let apart = joined(&past, &window(&run[8..=10]), 4.0);
         assert_eq!(times(&apart), [8.0, 9.0, 10.0], "nothing is known between 6 and 8");
-        let back = joined(&past, &window(1..=3, 2.0), 4.0);
-        assert_eq!(times(&back), [1.0, 2.0, 3.0], "a simulation that was set back");
+        let again = snapshots();
+        let back = joined(&past, &window(&again[4..=6]), 4.0);
+        assert_eq!(times(&back), [4.0, 5.0, 6.0], "a simulation that was set back goes another way than before");
     }
 
     #[test]

@@ -747,7 +747,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// The frames of one slide, and what commands ask for besides.
-    fn frames(&mut self, slides: &mut dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+    fn frames(&mut self, slides: &mut dyn Slides, slide: &mut Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let planned = warmups + time.frames_per_slide;
@@ -803,7 +803,7 @@ impl<B: Backend> Cycle<'_, B> {
                 // The first frame does not show the samples of the warm-up.
                 with!(&mut self.session, on => on.picture = Default::default());
             }
-            let start = Instant::now();
+            let mut start = Instant::now();
             if !place.is_warmup {
                 let shown = since_command.unwrap_or(number - warmups);
                 let is_open = target.is_some() || slides.is_awaited().is_some();
@@ -821,16 +821,21 @@ impl<B: Backend> Cycle<'_, B> {
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
             pace.add(self.run.render.method, &frame.record);
-            match target.zip(frame.record.picture_error).filter(|_| number >= warmups && !is_done) {
-                Some((target, error)) => refining.tell(self.run.render.method, target, &error, start, most.saturating_sub(number + 1)),
-                None => refining = Refining::default(),
-            }
+            let missed = target.zip(frame.record.picture_error).filter(|_| number >= warmups && !is_done);
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             self.run.check_end()?;
             if number == 0 || commands == Commands::Map {
                 let (map, asked, next) = (self.map.clone(), self.run.asked.clone(), slides.next_window());
+                let sunk = Instant::now();
                 sink(Event::Slide(Box::new(ShownSlide { slide: slide.clone(), map, asked, is_new: number == 0, next })));
+                // A map of the slide is no part of its frames, beside which a network may be trained as long.
+                let apart = sunk.elapsed();
+                (begun, start) = (begun + apart, start + apart);
+            }
+            match missed {
+                Some((target, error)) => refining.tell(self.run.render.method, target, &error, start, most.saturating_sub(number + 1)),
+                None => refining = Refining::default(),
             }
             number += 1;
             since_command = since_command.map(|frames: usize| frames + 1);

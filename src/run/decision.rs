@@ -23,7 +23,7 @@ impl Decision {
     }
 
     /// Adds the decision to others, of which it replaces the one for the same setting.
-    pub(super) fn enter(self, decisions: &mut Vec<Self>) {
+    pub(crate) fn enter(self, decisions: &mut Vec<Self>) {
         tracing::info!("{self}");
         match decisions.iter_mut().find(|decision| decision.setting == self.setting) {
             Some(before) => *before = self,

@@ -7,7 +7,7 @@ use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
 use crate::progress::{self, Work};
 use crate::setting::{Refused, shown};
-use crate::source::live::{LiveRecord, LiveWindow, NextWindow};
+use crate::source::live::{Follow, LiveRecord, LiveWindow, NextWindow};
 use crate::source::{
     Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, follow,
     read_ahead,
@@ -289,6 +289,8 @@ struct LiveSlides {
     window: LiveWindow,
     direction: Direction,
     count: Count,
+    /// The simulation waits until each of its steps is in a slide.
+    is_waited_for: bool,
 }
 
 impl Slides for LiveSlides {
@@ -334,7 +336,8 @@ impl Slides for LiveSlides {
     }
 
     fn next_window(&self) -> Option<NextWindow> {
-        Some(self.window.next_window())
+        // After the last slide none is delayed, but a simulation may wait.
+        (!self.count.is_over() || self.is_waited_for).then(|| self.window.next_window())
     }
 
     fn warnings(&mut self) -> Vec<String> {
@@ -401,7 +404,8 @@ pub(super) fn open_slides(
 
 /// The slides of a running simulation.
 pub(super) fn live_slides(scene: &Settings, window: LiveWindow, direction: Direction) -> Box<dyn Slides> {
-    Box::new(LiveSlides { window, direction, count: Count::new(scene, u64::MAX) })
+    let is_waited_for = scene.live.follow == Follow::Every;
+    Box::new(LiveSlides { window, direction, count: Count::new(scene, u64::MAX), is_waited_for })
 }
 
 /// Closed form that `[source]` describes; `None` for gridded kinds.

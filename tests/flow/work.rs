@@ -21,8 +21,9 @@ fn a_choice_of_steps_tells_how_far_the_log_stretch_is_from_what_is_allowed() {
         assert!(matches!(choosing.join().unwrap(), Err(FlowError::StepsNotFound { .. })));
         told
     });
-    let said = told.iter().find(|text| text.starts_with("choosing the steps of a path: with ")).unwrap();
-    assert!(said.contains("the log-stretch differs by ") && said.ends_with(", allowed are 1.0e-300"), "{said}");
+    // Other tests of this process may choose steps meanwhile.
+    let said = told.iter().find(|text| text.ends_with(", allowed are 1.0e-300")).unwrap_or_else(|| panic!("{told:?}"));
+    assert!(said.starts_with("choosing the steps of a path: with ") && said.contains("the log-stretch differs by "), "{said}");
     let mut of_steps = told.iter().filter(|text| text.starts_with("choosing"));
     assert!(of_steps.all(|text| !text.contains(" left")), "when it ends is not known: {told:?}");
 }

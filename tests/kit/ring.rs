@@ -20,7 +20,7 @@ impl Drop for Ring {
     }
 }
 
-/// A grid of cells of one metre.
+/// A grid over one metre along each axis.
 pub fn grid(nodes: &[u64]) -> Description {
     let axes = ["x", "y", "z"].into_iter().zip(nodes).map(|(name, nodes)| AxisDescription::uniform(name, "m", 0.0, 1.0, *nodes));
     Description::whole(Geometry::Cartesian, axes.collect(), "s")

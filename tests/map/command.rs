@@ -105,7 +105,7 @@ fn a_ridge_grid_that_is_too_coarse_is_told() {
         for panel in panels.as_array().unwrap() {
             assert_eq!(panel["ridge_roughness"].as_f64().unwrap() > 0.4, is_told, "{grid}: {panel}");
         }
-        let told = done.stderr.matches("take a finer --ridge-grid").count();
+        let told = done.stderr.matches("take a finer grid (`map --ridge-grid`)").count();
         assert_eq!((told, done.stderr.contains("backward FTLE, tau = ")), (if is_told { 2 } else { 0 }, is_told), "{}", done.stderr);
     }
 }
