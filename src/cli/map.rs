@@ -130,7 +130,7 @@ fn grid(text: &str) -> Result<[usize; 2], String> {
         .as_deref()
     {
         Some(&[x, y]) => Ok([x, y]),
-        _ => Err("accepted: NXxNY with numbers from 8 to 16384, and 2^24 nodes in all".into()),
+        _ => Err("accepted: NXxNY with numbers from 8 to 16384, and 2^25 nodes in all".into()),
     }
 }
 

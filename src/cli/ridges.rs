@@ -62,7 +62,7 @@ fn grid(text: &str) -> Result<Grid, String> {
             && numbers.iter().all(|n| (8..=16_384).contains(n))
             && numbers.iter().product::<usize>() <= MOST_NODES
     };
-    let accepted = "accepted: NXxNYxNZ, or NXxNY in two dimensions, with numbers from 8 to 16384, and 2^24 nodes in all";
+    let accepted = "accepted: NXxNYxNZ, or NXxNY in two dimensions, with numbers from 8 to 16384, and 2^25 nodes in all";
     dimensions(text).filter(fits).map(Grid).ok_or_else(|| accepted.into())
 }
 

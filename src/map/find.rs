@@ -195,7 +195,7 @@ pub fn find(
 /// Nodes of a volume, evenly spaced, at least 16 along each axis.
 fn volume_nodes(domain: &Domain) -> [usize; 3] {
     let lengths = domain.lengths();
-    let nodes = |step: f64| lengths.map(|length| ((length / step).round() as usize + 1).clamp(16, MOST_NODES >> 8));
+    let nodes = |step: f64| lengths.map(|length| ((length / step).round() as usize + 1).clamp(16, MOST_NODES >> 9));
     let mut step = (lengths.iter().product::<f64>() / VOLUME_NODES).cbrt();
     // Flat domains take more along their short axis than their share.
     while nodes(step).iter().product::<usize>() > MOST_NODES {

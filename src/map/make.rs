@@ -22,7 +22,7 @@ use crate::run::{Plan, RunError};
 use std::path::Path;
 
 /// Most nodes of the grid on which ridges are found: some GiB of memory.
-pub const MOST_NODES: usize = 1 << 24;
+pub const MOST_NODES: usize = 1 << 25;
 
 /// What a map shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -191,12 +191,12 @@ fn level(given: Option<f64>, domain: &crate::field::Domain) -> Result<f64, MapEr
     }
 }
 
-/// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes [`MOST_NODES`].
+/// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes a quarter of [`MOST_NODES`].
 pub(super) fn ridge_nodes(view: &View) -> [usize; 2] {
     let [west, south, east, north] = view.region;
     let shrink = if view.is_geographic { ((south + north) / 2.0).to_radians().cos().max(0.1) } else { 1.0 };
     let ratio = (east - west) * shrink / (north - south);
-    let nodes = (4 * view.size[0] * view.size[1]).min(MOST_NODES / 2);
+    let nodes = (4 * view.size[0] * view.size[1]).min(MOST_NODES / 4);
     let across = (nodes as f64 * ratio).sqrt();
     [across, across / ratio].map(|n| (n.round() as usize + 1).max(8))
 }

@@ -187,7 +187,7 @@ impl Volume {
                     return (number != NONE).then_some(number);
                 }
                 let point = self.crossing(node(from), node(to), p ^ q, shapes).filter(|point| point.value >= faint);
-                // Seven edges a node, of at most 2^24 nodes.
+                // Seven edges a node, of at most 2^25 nodes.
                 slab.numbers[from >> 2][place] = if point.is_some() { slab.points.len() as u32 } else { NONE };
                 slab.points.extend(point);
                 point.map(|_| slab.points.len() as u32 - 1)

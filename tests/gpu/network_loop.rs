@@ -399,7 +399,13 @@ fn offline_training_is_fitted_to_the_window_as_a_run_is() {
     let settings = scene::parse(&text, &[]).unwrap().settings();
     let report = train(&settings, &wanted, &device, 0, &mut |_, _| (), &AtomicBool::new(false)).unwrap();
     assert_eq!(expected.len(), 5, "{expected:?}");
-    assert_eq!(of_network(report.decisions), expected);
+    let (mut found, mut expected) = (of_network(report.decisions), expected);
+    let [batch, of_run] = [&mut found, &mut expected].map(|decisions| {
+        let place = decisions.iter().position(|decision| decision.setting == "network.batch").unwrap();
+        decisions.remove(place).chosen
+    });
+    assert_eq!([batch, of_run], ["64", "262144"], "64 steps an epoch of 4096 labels");
+    assert_eq!(found, expected);
     let report = train(&settings, &wanted, &Device::CPU, 0, &mut |_, _| (), &AtomicBool::new(false)).unwrap();
     assert!(report.decisions.is_empty(), "{:?}", report.decisions);
 }

@@ -178,7 +178,7 @@ fn what_does_not_fit_is_refused_and_named() {
         (&[&gyre, "-o", "a.ply"], &["--out a.ply", ".nc or .vtk"]),
         (&[&abc, "-o", "a.ply", "--grid", "64x64"], &["--grid 64x64", "3 dimensions", "accepted: NXxNYxNZ"]),
         (&[&gyre, "-o", "a.vtk", "--grid", "64x64x8"], &["--grid 64x64x8", "2 dimensions", "accepted: NXxNY"]),
-        (&[&abc, "-o", "a.ply", "--grid", "512x512x512"], &["--grid", "2^24 nodes"]),
+        (&[&abc, "-o", "a.ply", "--grid", "512x512x512"], &["--grid", "2^25 nodes"]),
         (&[&abc, "-o", "a.ply", "--length", "3"], &["--length", "accepted: --area"]),
         (&[&gyre, "-o", "a.vtk", "--area", "3"], &["--area", "accepted: --length"]),
         (&[&abc, "-o", "a.ply", "--sharpness", "101"], &["--sharpness", "0 to 100"]),
