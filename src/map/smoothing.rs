@@ -43,11 +43,11 @@ pub(super) fn roughness(values: &[f32], size: &[usize]) -> f64 {
         let at = |node: usize| f64::from(values[node]);
         let inner = |node: &usize| (1..length - 1).contains(&(node / stride % length));
         let difference = |node: usize| at(node) - (at(node - stride) + at(node + stride)) / 2.0;
-        let of_axis = moments((0..values.len()).into_par_iter().filter(inner).map(difference));
+        let of_axis = moments(values.len(), |node| Some(node).filter(inner).map(difference));
         differences = [differences[0] + of_axis[0], differences[1] + of_axis[2]];
         stride *= length;
     }
-    let [count, sum, squares] = moments(values.par_iter().map(|v| f64::from(*v)));
+    let [count, sum, squares] = moments(values.len(), |node| Some(f64::from(values[node])));
     let variance = squares / count - (sum / count).powi(2);
     if variance > 0.0 && differences[0] > 0.0 { (differences[1] / differences[0] / variance).sqrt() } else { 0.0 }
 }
@@ -74,9 +74,17 @@ pub(super) fn too_coarse(roughness: f64, option: &str) -> Option<String> {
     })
 }
 
-/// Count, sum and sum of squares of the finite values.
-fn moments(values: impl ParallelIterator<Item = f64>) -> [f64; 3] {
-    values.filter(|v| v.is_finite()).map(|v| [1.0, v, v * v]).reduce(|| [0.0; 3], |a, b| std::array::from_fn(|k| a[k] + b[k]))
+/// Number, sum and sum of squares of the finite values at so many nodes; `None` where none is wanted. Summed in parts, so that the rounding does not
+/// depend on the number of threads.
+fn moments(nodes: usize, value: impl Fn(usize) -> Option<f64> + Sync) -> [f64; 3] {
+    const PART: usize = 1 << 14;
+    let add = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] + b[k]);
+    let of_part = |part: usize| {
+        let finite = (part * PART..nodes.min((part + 1) * PART)).filter_map(&value).filter(|v| v.is_finite());
+        finite.map(|v| [1.0, v, v * v]).fold([0.0; 3], add)
+    };
+    let parts: Vec<[f64; 3]> = (0..nodes.div_ceil(PART)).into_par_iter().map(of_part).collect();
+    parts.into_iter().fold([0.0; 3], add)
 }
 
 #[cfg(test)]
