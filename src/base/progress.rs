@@ -43,7 +43,7 @@ impl Told {
     }
 }
 
-/// All work in progress, in the order in which it began.
+/// All work in progress, in the order in which it was begun here.
 static TOLD: Mutex<Vec<Told>> = Mutex::new(Vec::new());
 
 fn lock() -> MutexGuard<'static, Vec<Told>> {

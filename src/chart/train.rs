@@ -10,6 +10,7 @@ use crate::backend::{Backend, Cpu, Device, FrameJob, Interruptible, Rendered, Ro
 use crate::flow::Extras;
 use crate::render::{Film, Renderer, Scene};
 use crate::run::{Decision, RunError, Settings, cpu_batch, suited_network};
+use crate::surrogate::network::SMALLEST_BATCH;
 use crate::surrogate::{Predict, ReplayBuffer, Samples};
 use crate::trust::Gate;
 use serde::Serialize;
@@ -19,8 +20,6 @@ use std::time::Instant;
 
 /// Fewest steps of an epoch, if the scene leaves the batch of a GPU open.
 const LEAST_STEPS: usize = 64;
-/// Smallest batch that a scene may give.
-const MIN_BATCH: usize = 64;
 
 /// How long a network is trained, and on what.
 #[derive(Debug, Clone, PartialEq)]
@@ -99,7 +98,7 @@ pub fn train(
     if let Some(shape) = opened.shape().filter(|_| device.is_gpu()) {
         settings.network = suited_network(&settings.network, shape, &mut decisions);
         // A run draws labels without an end; here they are given.
-        let most = 1 << (options.labels / LEAST_STEPS).max(MIN_BATCH).ilog2();
+        let most = 1 << (options.labels / LEAST_STEPS).max(SMALLEST_BATCH).ilog2();
         if settings.network.gpu_batch.is_some_and(|batch| batch > most) {
             settings.network.gpu_batch = Some(most);
             let why = format_args!("at least {LEAST_STEPS} steps an epoch of {} labels", options.labels);

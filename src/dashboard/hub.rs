@@ -15,8 +15,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 
-/// A run that leaves no mark of progress for so long may hang. Work on a GPU leaves them between its parts.
-const HANGS: Duration = Duration::from_secs(60);
 /// Maximum length of a published message, in bytes: a lossless picture of 16 million pixels.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// Maximum length of a picture that is shown, in bytes. Some proxies accept 10 MB.
@@ -37,6 +35,8 @@ const RECONNECT: Duration = Duration::from_millis(500);
 /// Silence after which a publisher counts as silent, if it is also so many times the usual interval of its records.
 const SILENT: Duration = Duration::from_secs(3);
 const SILENT_INTERVALS: u32 = 5;
+/// A run that leaves no mark of progress for so long may hang.
+const HANGS: Duration = Duration::from_secs(60);
 /// Intervals whose median is the usual one.
 const INTERVALS: usize = 9;
 

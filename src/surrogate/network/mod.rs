@@ -36,6 +36,6 @@ pub use objective::{Field, Objective, Scale, signed_exp, signed_log};
 pub use operation::{FusedNetwork, NetworkInputs};
 pub use predictor::Predictor;
 pub use random::{draw, uniform};
-pub use settings::{Encoding, Input, Loss, NetworkSettings, Size, Target};
+pub use settings::{Encoding, Input, Loss, NetworkSettings, SMALLEST_BATCH, Size, Target};
 pub use times::{Row, Times, UNTIMED, row};
 pub use train::{Average, Fused, HELD_OUT, PlannedStep, Step};

@@ -4,6 +4,9 @@ use crate::SurrogateError;
 use ridgewatch_flow::Extras;
 use serde::{Deserialize, Serialize};
 
+/// Fewest samples of an optimizer step.
+pub const SMALLEST_BATCH: usize = 64;
+
 /// Encoding of the inputs of the MLP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -233,7 +236,7 @@ impl NetworkSettings {
         check("mean_penalty", self.mean_penalty, 0.0, 1e6)?;
         check("jacobian_weight", self.jacobian_weight, 0.0, 1e6)?;
         check("averaging", self.averaging, 0.0, 1.0)?;
-        check("batch", self.batch_on(false), 64, 1 << 22)?;
+        check("batch", self.batch_on(false), SMALLEST_BATCH, 1 << 22)?;
         self.learning_rate.map_or(Ok(()), |rate| check("learning_rate", rate, 1e-9, 1.0))
     }
 }
