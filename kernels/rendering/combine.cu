@@ -1,7 +1,7 @@
 // Combines the marched picture with the correction. First combine_guides, combine_filter with spacings 1 and 2, combine_normal and combine_solve. For
 // each half: combine_rest, then per level combine_rows, combine_columns, combine_box (energies) and
 // combine_gains; combine_last stands in for the first two on the last level. Then combine_tiles, and, once the host has the tiles' sums,
-// combine_box (squared errors) and combine_errors.
+// combine_errors.
 #include "rendering/regression.cuh"
 
 using namespace rw;
@@ -80,9 +80,8 @@ extern "C" __global__ void __launch_bounds__(256) combine_tiles(const Combine co
     finish_tile(Block{}, combine, int(blockIdx.x), int(blockIdx.y), memory);
 }
 
-// Blocks of BOX_LINES x BOX_COLUMN pixels. sums: the planes `squared` after combine_box.
-extern "C" __global__ void __launch_bounds__(256)
-combine_errors(const Combine combine, const float* __restrict__ sums, int radius, float floor, float added) {
-    __shared__ float memory[BOX_COLUMN_MEMORY];
-    finish_errors(Block{}, combine, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, floor, added, memory);
+// Blocks of 32 x 8 pixels.
+extern "C" __global__ void __launch_bounds__(256) combine_errors(const Combine combine, float marched) {
+    const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
+    if (x < combine.width && y < combine.height) finish_error(combine, x, y, marched);
 }

@@ -251,7 +251,7 @@ struct Combine {
     const double* base;   // RAY_FIELDS planes of sums over rays
     const float* halves;  // shrunk corrections, 3 planes of each half
     float* film;          // rgba of each pixel, then planes: mean FTLE, error, missing, samples, 1 where there are samples
-    float* squared;       // 2 planes: squared error, mean over the channels, and 1 where it is known, otherwise 0 and 0
+    const float* errors;  // of each tile the mean square error of its other pixels and of those that are lit
     float* tiles;         // TILE_FIELDS a tile, rows of tiles from the top
     double per_ray;       // 1 / rays of a pixel
     int width;
@@ -364,8 +364,6 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
     planes[2 * pixels] = float(base[5] * c.per_ray);
     planes[3 * pixels] = 2.0f * all;
     planes[4 * pixels] = known ? 1.0f : 0.0f;
-    c.squared[at] = known ? (found[0][0] + found[0][1] + found[0][2]) / 3.0f : 0.0f;
-    c.squared[pixels + at] = known ? 1.0f : 0.0f;
     auto put = [&](int field, float value) {
         fields[field * stride] = value;
         fields[(ERROR_FIELDS + field) * stride] = is_lit ? value : 0.0f;
@@ -414,19 +412,27 @@ RW_FN void finish_tile(const Block& block, const Combine& c, int column, int row
     });
 }
 
-// The error of each pixel from squared errors summed along rows: the root of their mean over a square, at least `floor`, plus `added`. NaN where
-// no pixel of the square has pairs.
-RW_FN void finish_errors(const Block& block, const Combine& c, const float* sums, int x, int y, int radius, float floor, float added, float* memory) {
-    const size_t pixels = size_t(c.width) * c.height;
-    using Sums = const float (&)[BOX_GROUP];
-    box_columns(block, sums, c.width, c.height, x, y, radius, memory, [&](const int (&at)[BOX_GROUP], Sums squared, Sums counts) {
-        RW_UNROLL
-        for (int n = 0; n < BOX_GROUP; ++n) {
-            // As in Rust, the larger one of NaN and a number is the number.
-            const float mean = counts[n] > 0.5f ? squared[n] / counts[n] : not_a_number();
-            if (at[n] >= 0) c.film[5 * pixels + at[n]] = sqrtf(max_(mean, floor) + added);
-        }
-    });
+// The error of a pixel from the mean square errors of the tiles: linear between their middles, plus `marched` if the pixel is lit.
+RW_FN void finish_error(const Combine& c, int x, int y, float marched) {
+    const size_t at = size_t(y) * c.width + x;
+    const int pixel[2] = {x, y}, counts[2] = {(c.width + TILE - 1) / TILE, (c.height + TILE - 1) / TILE};
+    const bool is_lit = reinterpret_cast<const Float4*>(c.film)[at].w > c.lit;
+    int first[2], next[2];
+    float share[2];
+    RW_UNROLL
+    for (int k = 0; k < 2; ++k) {
+        const float place = min_(max_((float(pixel[k]) + 0.5f) / float(TILE) - 0.5f, 0.0f), float(counts[k] - 1));
+        first[k] = counts[k] > 1 && int(place) > counts[k] - 2 ? counts[k] - 2 : int(place);
+        next[k] = first[k] + 1 < counts[k] ? first[k] + 1 : first[k];
+        share[k] = place - float(first[k]);
+    }
+    auto along = [&](int row) {
+        const float* errors = c.errors + 2 * size_t(row) * counts[0] + (is_lit ? 1 : 0);
+        return errors[2 * first[0]] + share[0] * (errors[2 * next[0]] - errors[2 * first[0]]);
+    };
+    const float top = along(first[1]);
+    const float squared = top + share[1] * (along(next[1]) - top);
+    c.film[5 * size_t(c.width) * c.height + at] = sqrtf(squared + (is_lit ? marched : 0.0f));
 }
 
 }  // namespace rw

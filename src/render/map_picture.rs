@@ -4,7 +4,7 @@
 //! the other. Seeds accumulate while the view stands still; other colours need none.
 
 use super::renderer::{RenderStats, Renderer};
-use super::smooth::{ERROR_FLOOR, ERROR_RADIUS, MarchError, PictureError, TILE, TileSums, smoothed};
+use super::smooth::{MarchError, PictureError, TILE, TileSums, smoothed};
 use super::{CameraSettings, Film, LogStretch};
 use rayon::prelude::*;
 use ridgewatch_field::DomainPoint;
@@ -15,6 +15,10 @@ use std::time::Instant;
 pub const MAP_TONE: [f64; 3] = [1.0, 0.5, 2.2];
 /// Seeds that are traced at once, which bounds the memory beside the picture.
 const AT_ONCE: usize = 1 << 21;
+/// Radius over which the squared error of a pixel is averaged, in pixels.
+const ERROR_RADIUS: usize = 8;
+/// Floor of a pixel's squared error, as a share of the map's mean.
+const ERROR_FLOOR: f64 = 0.05;
 /// Pixels of a task of one thread.
 const TASK: usize = 1 << 12;
 

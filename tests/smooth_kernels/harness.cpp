@@ -139,11 +139,13 @@ int main(int, char** arguments) {
         c.contrast = tone[0], c.brightness = tone[1], c.gamma = tone[2];
         c.lit = take_one<float>();
         c.per_ray = take_one<double>();
-        const float floor = take_one<float>(), added = take_one<float>();
+        const float marched = take_one<float>();
         const int width = c.width, height = c.height;
         const size_t pixels = size_t(width) * height;
         const auto sums = take<float>(15 * pixels);
         const auto base = take<double>(RAY_FIELDS * pixels);
+        const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
+        const auto errors = take<float>(2 * size_t(across) * down);
         std::vector<float> coarse(8 * pixels), rows(8 * pixels), mean(3 * pixels), energy(2 * pixels), boxed(2 * pixels), halves(6 * pixels, NAN);
         std::vector<float> row_memory(BOX_ROW_MEMORY), column_memory(BOX_COLUMN_MEMORY), tile_memory(TILE_MEMORY);
         const Level level = {mean.data(), energy.data(), width, height};
@@ -206,16 +208,14 @@ int main(int, char** arguments) {
                 fine = filtered;
             }
         }
-        const int across = (width + TILE - 1) / TILE, down = (height + TILE - 1) / TILE;
-        std::vector<float> film(9 * pixels, NAN), squared(2 * pixels, NAN), tiles(size_t(across) * down * TILE_FIELDS, NAN);
+        std::vector<float> film(9 * pixels, NAN), tiles(size_t(across) * down * TILE_FIELDS, NAN);
         c.sums = sums.data(), c.base = base.data(), c.halves = halves.data();
-        c.film = film.data(), c.squared = squared.data(), c.tiles = tiles.data();
+        c.film = film.data(), c.errors = errors.data(), c.tiles = tiles.data();
         for (int row = 0; row < down; ++row) {
             for (int column = 0; column < across; ++column) finish_tile(block, c, column, row, tile_memory.data());
         }
-        box_rows(squared.data(), 8);
-        for (int y = 0; y < height; y += BOX_COLUMN) {
-            for (int x = 0; x < width; x += BOX_LINES) finish_errors(block, c, boxed.data(), x, y, 8, floor, added, column_memory.data());
+        for (int y = 0; y < height; ++y) {
+            for (int x = 0; x < width; ++x) finish_error(c, x, y, marched);
         }
         give(film);
         give(tiles);

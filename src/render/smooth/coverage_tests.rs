@@ -130,6 +130,39 @@ fn intervals_hold_over_scenes_and_numbers_of_samples() {
     assert!(inside * 100 >= known * 93 && above > 0 && below > 0, "{all:?}");
 }
 
+/// Fails if each pixel's error is that of the squares around it alone, whose few samples mostly see nothing of heavy tails.
+#[test]
+#[allow(clippy::print_stdout)]
+fn errors_of_pixels_hold() {
+    const WIDTH: usize = 96;
+    const SEEDS: u64 = 8;
+    let mut shares = Vec::new();
+    for which in 0..3 {
+        let [traced, surrogate] = fields(which);
+        let exact = exact(&traced, WIDTH);
+        for (method, rounds) in [(Method::TwoLevel, 1), (Method::TwoLevel, 4), (Method::Marched, 2)] {
+            let found = |seed: u64| {
+                let mut renderer = renderer(WIDTH, 100 + seed);
+                let (mut picture, mut last) = (Picture::default(), None);
+                for number in 0..rounds {
+                    let round = Refinement { nodes: &surrogate, missing: None, method, sum: false, samples: 1.0, number, stop: &NEVER };
+                    last = renderer.refine(&mut picture, &round, &mut Traced(&traced));
+                }
+                let film = last.unwrap().0;
+                let square = |i: usize| (0..3).map(|k| (f64::from(film.rgba[i][k]) - exact[i][k]).powi(2)).sum::<f64>() / 3.0;
+                let lit: Vec<usize> = (0..exact.len()).filter(|&i| film.rgba[i][3] > 0.01).collect();
+                let held = lit.iter().filter(|&&i| square(i) <= (1.96 * f64::from(film.error[i])).powi(2)).count();
+                held as f64 / lit.len() as f64
+            };
+            let held = (0..SEEDS).into_par_iter().map(found).sum::<f64>() / SEEDS as f64;
+            println!("field {which}, {method:?}, {rounds} rounds: {:.1} % of the lit pixels", 100.0 * held);
+            shares.push(held);
+        }
+    }
+    let mean = shares.iter().sum::<f64>() / shares.len() as f64;
+    assert!((0.93..0.98).contains(&mean) && shares.iter().all(|share| (0.88..0.99).contains(share)), "{mean:.3}: {shares:.3?}");
+}
+
 /// Fails if the estimate alone decides: most of the frames that it picks are lucky ones.
 #[test]
 fn a_target_is_reached_when_it_is_met() {

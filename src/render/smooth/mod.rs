@@ -19,7 +19,8 @@ mod statement;
 mod tone;
 
 pub use allocation::bayer_rank;
-pub use combine::{Combined, Correction, PairSums, combine, smoothed};
+pub(crate) use combine::smoothed;
+pub use combine::{Combined, Correction, PairSums, combine};
 pub use coupled::{CoupledPath, coupled_paths};
 pub use light_volume::{LightGrid, LightVolume, MARGIN};
 pub use march::{RaySum, ToLight};
@@ -31,7 +32,7 @@ pub use statement::{ErrorEstimate, MarchError, PictureError, TileErrors, TileSum
 pub use {
     allocation::{Allocation, TILE},
     march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR},
-    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
-    statement::LIT,
+    picture::AUDIT_PAIRS,
+    statement::{LIT, TileError, error_at, errors_of_tiles},
     tone::{ToneMap, squared_slope},
 };

@@ -1,7 +1,7 @@
 //! A picture that accumulates on the CPU: rays marched through the surrogate, and pairs of coupled samples where the variance is.
 
 use super::allocation::{Allocation, TILE, pixels, quarter, tiles};
-use super::combine::{Combined, Correction, PairSums, combine, smoothed};
+use super::combine::{Combined, Correction, PairSums, combine};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
@@ -9,7 +9,7 @@ use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH,
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
-use super::statement::{LIT, PictureError, TileErrors, TileSums};
+use super::statement::{LIT, PictureError, TileErrors, TileSums, error_at, errors_of_tiles};
 use super::tone::ToneMap;
 use crate::renderer::RenderStats;
 use crate::rng::FrameRandom;
@@ -31,10 +31,6 @@ const MAX_PAIRS: usize = 1 << 19;
 const MIN_MARCH_SECONDS: f64 = 0.1;
 /// Pixels of which one leaves a mark of progress.
 const MARKED: usize = 1 << 10;
-/// Radius over which the squared error of a pixel is averaged, in pixels.
-pub const ERROR_RADIUS: usize = 8;
-/// Floor of a pixel's squared error, as a share of the frame's mean.
-pub const ERROR_FLOOR: f64 = 0.05;
 
 /// One round of refinement.
 pub struct Refinement<'a> {
@@ -307,9 +303,14 @@ impl Picture {
         // A pixel without pairs shows the march of the surrogate.
         let unbiased = how == Correction::Summed && self.sums.iter().all(|sums| sums.pairs() > 0);
         let error = PictureError { unbiased, ..PictureError::of(&tiles, &self.march.errors(), samples_per_pixel, self.march.rays) };
-        let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
-        let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };
-        film.error = smoothed(&mean, width, ERROR_RADIUS).into_iter().map(|e| (e.max(floor) + march as f32).sqrt()).collect();
+        let (of_tiles, across) = (errors_of_tiles(&tiles), width.div_ceil(TILE));
+        let of_pixel = |(i, colour): (usize, &[f32; 4])| {
+            let is_lit = colour[3] > LIT;
+            // Pixels that are not lit have hardly any of the march's.
+            let marched = if is_lit { march as f32 } else { 0.0 };
+            (error_at(&of_tiles, across, [i % width, i / width], is_lit) + marched).sqrt()
+        };
+        film.error = film.rgba.par_iter().enumerate().with_min_len(1 << 12).map(of_pixel).collect();
         (film, error, tiles)
     }
 

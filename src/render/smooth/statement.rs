@@ -1,6 +1,7 @@
 //! The error that a picture states, from sums over tiles.
 
 use super::super::Film;
+use super::allocation::TILE;
 use super::tone::squared_slope;
 use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
@@ -170,6 +171,74 @@ impl PictureError {
     }
 }
 
+/// Mean square errors in a tile of the pixels that are not lit, and of those that are: linear radiance, mean over the channels.
+pub type TileError = [f32; 2];
+
+/// Least error of a tile, as a share of the mean square of all.
+const LEAST_SHARE: f64 = 0.05;
+
+/// The error of pixels, tile by tile, without that of marching; NaN if there are no pairs.
+///
+/// The pixels of one tile are too few to tell its error: of the heavy tails that errors have they mostly see nothing. So its mean square is drawn to that
+/// of all tiles, as far as they differ by no more than their scatters explain (Efron and Morris 1975).
+pub fn errors_of_tiles(tiles: &[TileSums]) -> Vec<TileError> {
+    let dark = |tile: &TileSums| {
+        let less = |of: fn(&TileErrors) -> f32| of(&tile.all) - of(&tile.lit);
+        TileErrors {
+            squared: std::array::from_fn(|k| tile.all.squared[k] - tile.lit.squared[k]),
+            scatter: std::array::from_fn(|k| tile.all.scatter[k] - tile.lit.scatter[k]),
+            radiance: std::array::from_fn(|k| tile.all.radiance[k] - tile.lit.radiance[k]),
+            pixels: less(|errors| errors.pixels),
+            pairs: less(|errors| errors.pairs),
+        }
+    };
+    let all: Vec<TileErrors> = tiles.iter().map(|tile| tile.all).collect();
+    let [dark, lit] = [tiles.iter().map(dark).collect::<Vec<_>>(), tiles.iter().map(|tile| tile.lit).collect()].map(|group| {
+        let is_seen = group.iter().any(|tile| tile.pixels > 0.0);
+        drawn_together(if is_seen { &group } else { &all })
+    });
+    dark.into_iter().zip(lit).map(|(dark, lit)| [dark, lit]).collect()
+}
+
+/// Mean square errors of tiles, drawn to their mean.
+fn drawn_together(tiles: &[TileErrors]) -> Vec<f32> {
+    let mean = estimate(tiles.iter(), 0).value;
+    if !mean.is_finite() {
+        return vec![f32::NAN; tiles.len()];
+    }
+    let (mut noise, mut apart, mut count, mut squares) = (0.0, 0.0, 0.0, 0.0);
+    for tile in tiles {
+        let pixels = f64::from(tile.pixels);
+        noise += f64::from(tile.scatter[0]).powi(2);
+        apart += (f64::from(tile.squared[0]) - mean * pixels).powi(2);
+        count += pixels;
+        squares += pixels * pixels;
+    }
+    // Variances of what tiles differ by, and of the noise of a pixel.
+    let (own, noise) = ((apart - noise).max(0.0) / squares, noise / count);
+    let of_tile = |tile: &TileErrors| {
+        let pixels = f64::from(tile.pixels);
+        let trusted = if pixels > 0.0 && own > 0.0 { own * pixels / (own * pixels + noise) } else { 0.0 };
+        let seen = f64::from(tile.squared[0]) / pixels.max(1.0);
+        (mean + trusted * (seen - mean)).max(LEAST_SHARE * mean) as f32
+    };
+    tiles.iter().map(of_tile).collect()
+}
+
+/// Mean square error at a pixel: linear between the middles of the tiles of a picture that has `across` of them in a row.
+pub fn error_at(tiles: &[TileError], across: usize, [x, y]: [usize; 2], is_lit: bool) -> f32 {
+    let down = tiles.len() / across;
+    let between = |pixel: usize, count: usize| {
+        let place = ((pixel as f32 + 0.5) / TILE as f32 - 0.5).clamp(0.0, (count - 1) as f32);
+        let first = (place as usize).min(count.max(2) - 2);
+        (first, (first + 1).min(count - 1), place - first as f32)
+    };
+    let ((left, right, u), (top, bottom, v)) = (between(x, across), between(y, down));
+    let at = |row: usize, column: usize| tiles[row * across + column][usize::from(is_lit)];
+    let along = |row: usize| at(row, left) + u * (at(row, right) - at(row, left));
+    along(top) + v * (along(bottom) - along(top))
+}
+
 /// PSNR over lit pixels, in decibels, of the mean of two independent pictures, from their difference. `tone_map` is `[contrast, brightness, gamma]`.
 pub fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
     let (mut sum, mut lit) = (0.0, 0.0);
@@ -235,6 +304,65 @@ mod tests {
         let other = ErrorEstimate { value: 10.0, low: 8.5, high: 10.0 };
         assert_eq!(march.added_to(other, 0, 1.0), interval(14.0, 11.5, 16.0));
         assert_eq!(march.added_to(other, 0, 0.0), other);
+    }
+
+    /// Tiles of 256 pixels, half of them lit: mean square errors of the lit pixels, and deviation of the noise of their mean.
+    fn tiles_of(errors: &[f32], noise: f32) -> Vec<TileSums> {
+        let tile = |(number, &error): (usize, &f32)| {
+            // As many above as below, and some that see nothing at all.
+            let seen = [-1.0, 1.0, -0.5, 0.5][number % 4] * noise;
+            let sums = |squared: f32, scatter: f32, pixels: f32| TileErrors {
+                squared: [squared; 3],
+                scatter: [scatter; 3],
+                pixels,
+                pairs: pixels,
+                ..TileErrors::default()
+            };
+            let lit = sums(128.0 * (error + seen), 128.0 * seen, 128.0);
+            TileSums { all: sums(lit.squared[0] + 128.0 * 1e-6, lit.scatter[0], 256.0), lit, variance: 0.0 }
+        };
+        errors.iter().enumerate().map(tile).collect()
+    }
+
+    #[test]
+    fn tiles_state_what_all_show_unless_they_differ() {
+        // Noise as large as the error: nothing tells the tiles apart.
+        for error in errors_of_tiles(&tiles_of(&[1.0; 64], 1.0)) {
+            assert!((error[1] - 1.0).abs() < 0.05 && (error[0] - 1e-6).abs() < 1e-7, "{error:?}");
+        }
+        // One is far more wrong than its noise, in which others see nothing.
+        let mut errors = [1.0; 64];
+        errors[40] = 100.0;
+        let found = errors_of_tiles(&tiles_of(&errors, 1.0));
+        assert!(found[40][1] > 70.0, "{:?}", found[40]);
+        assert!(found.iter().enumerate().all(|(tile, error)| tile == 40 || (0.1..4.0).contains(&error[1])), "{found:?}");
+        // Without noise each has its own.
+        let errors: Vec<f32> = (1..64).map(|error| error as f32).collect();
+        let found = errors_of_tiles(&tiles_of(&errors, 0.0));
+        assert!(found.iter().zip(&errors).all(|(found, error)| (found[1] - error.max(0.05 * 32.0)).abs() < 1e-3), "{found:?}");
+    }
+
+    #[test]
+    fn tiles_without_pairs_take_the_error_of_others() {
+        let mut tiles = tiles_of(&[1.0; 16], 0.1);
+        tiles[3] = TileSums::default();
+        assert!((errors_of_tiles(&tiles)[3][1] - 1.0).abs() < 0.05);
+        assert!(errors_of_tiles(&[TileSums::default(); 4]).iter().flatten().all(|error| error.is_nan()));
+        // No pixel that is lit has pairs: the others tell.
+        let dark = TileSums { lit: TileErrors::default(), ..tiles[0] };
+        let found = errors_of_tiles(&[dark; 4]);
+        assert!(found.iter().all(|error| error[0] > 0.0 && error[1] == error[0]), "{found:?}");
+    }
+
+    #[test]
+    fn the_error_of_a_pixel_lies_between_those_of_the_tiles_around_it() {
+        let tiles = [[0.0, 1.0], [0.0, 3.0], [0.0, 5.0], [0.0, 7.0], [0.0, 9.0], [8.0, 11.0]];
+        let at = |x: usize, y: usize| error_at(&tiles, 3, [x, y], true);
+        assert_eq!([at(0, 0), at(7, 7), at(47, 31)], [1.0, 1.0, 11.0], "outside of all middles: the nearest");
+        assert!((at(15, 3) - 1.9375).abs() < 1e-6 && (at(16, 3) - 2.0625).abs() < 1e-6, "{} {}", at(15, 3), at(16, 3));
+        assert!((at(8, 16) - (1.0625 + 6.0 * 0.53125)).abs() < 1e-6, "{}", at(8, 16));
+        assert_eq!(error_at(&tiles, 3, [47, 31], false), 8.0);
+        assert_eq!(error_at(&[[2.0, 4.0]], 1, [9, 3], true), 4.0);
     }
 
     #[test]

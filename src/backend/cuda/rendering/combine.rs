@@ -11,14 +11,14 @@ use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_render::Combine as Combination;
 use ridgewatch_render::Film;
-use ridgewatch_render::smooth::{TILE, TileSums};
+use ridgewatch_render::smooth::{TILE, TileError, TileSums};
 use std::sync::Arc;
 
 /// Scales of the transform.
 const LEVELS: u32 = 5;
 /// Radius over which energies are summed, and the largest one that the kernels can sum, in pixels.
 const RADIUS: i32 = 32;
-/// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
+/// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains`.
 const BOX_ROW: usize = 1024;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
 /// First plane of the pairs by quarter in the sums (see [`SUM_PLANES`]).
@@ -58,7 +58,7 @@ struct CombineArgument {
     base: u64,
     halves: u64,
     film: u64,
-    squared: u64,
+    errors: u64,
     tiles: u64,
     per_ray: f64,
     width: i32,
@@ -175,7 +175,6 @@ struct Planes {
     mean: usize,
     halves: usize,
     film: usize,
-    squared: usize,
     /// Guides of the regression, and what is left to be shrunk, which the first level reads before the second writes there.
     guides: usize,
     around: usize,
@@ -183,20 +182,8 @@ struct Planes {
     count: usize,
 }
 
-const PLANES: Planes = Planes {
-    coarse: [0, 29],
-    rows: 8,
-    energy: 16,
-    boxed: 18,
-    mean: 20,
-    halves: 23,
-    film: 0,
-    squared: 9,
-    guides: 37,
-    around: 45,
-    rest: 29,
-    count: 53,
-};
+const PLANES: Planes =
+    Planes { coarse: [0, 29], rows: 8, energy: 16, boxed: 18, mean: 20, halves: 23, film: 0, guides: 37, around: 45, rest: 29, count: 53 };
 
 /// Combines pictures. It reuses its memory between frames: 53 planes.
 pub struct GpuCombine {
@@ -217,6 +204,7 @@ pub struct GpuCombine {
     /// Partial sums of the normal equations, then the coefficients.
     normal_sums: Option<Buffer<f64>>,
     tile_sums: Option<Buffer<f32>>,
+    tile_errors: Option<Buffer<TileError>>,
     tiles_read: Option<Pinned<f32>>,
     /// Argument of the picture that [`Self::finish`] completes.
     begun: Option<CombineArgument>,
@@ -246,6 +234,7 @@ impl GpuCombine {
             planes: None,
             normal_sums: None,
             tile_sums: None,
+            tile_errors: None,
             tiles_read: None,
             begun: None,
         })
@@ -301,12 +290,13 @@ impl GpuCombine {
         let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];
         let count = tiles[0] * tiles[1] * TILE_FIELDS;
         let tile_sums = room(&gpu, &mut self.tile_sums, "errors of tiles", count)?.address();
+        let tile_errors = room(&gpu, &mut self.tile_errors, "errors of tiles", tiles[0] * tiles[1])?.address();
         let argument = CombineArgument {
             sums: input.pairs.address(),
             base,
             halves: plane(PLANES.halves),
             film: plane(PLANES.film),
-            squared: plane(PLANES.squared),
+            errors: tile_errors,
             tiles: tile_sums,
             per_ray: 1.0 / f64::from(input.march.rays()),
             width: width as i32,
@@ -415,35 +405,28 @@ impl GpuCombine {
     }
 
     /// Completes the film of the latest [`Self::combine`] and copies it to `film`; with `shows_march` without FTLE and missing cells, since `film` shows
-    /// the same march already. The error of a pixel is the root of the mean squared error over a square of `radius` pixels (a power of two, at most 32),
-    /// which is at least `floor`, plus `added`.
+    /// the same march already. The error of a pixel is that of the `tiles` around it (see `render::smooth::error_at`), with `marched`, a mean square,
+    /// added where it is lit.
     ///
     /// # Errors
-    /// Nothing was combined, `film` is held elsewhere or has another size, or the device fails or lacks memory.
-    ///
-    /// # Panics
-    /// If the radius is not one of those.
-    pub fn finish(&mut self, radius: u32, floor: f32, added: f32, film: &mut PinnedFilm, shows_march: bool) -> Result<(), DeviceError> {
-        assert!(radius.is_power_of_two() && radius <= RADIUS as u32, "a radius that the kernels can sum");
-        let (Some(argument), Some(planes)) = (self.begun.take(), &self.planes) else {
+    /// Nothing was combined, `film` is held elsewhere or it or the tiles have another size, or the device fails.
+    pub fn finish(&mut self, tiles: &[TileError], marched: f32, film: &mut PinnedFilm, shows_march: bool) -> Result<(), DeviceError> {
+        let (Some(argument), Some(tile_errors)) = (self.begun.take(), &mut self.tile_errors) else {
             return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
         };
         let size = [argument.width as usize, argument.height as usize];
         let pixels = size[0] * size[1];
-        let (gpu, radius) = (self.gpu.clone(), radius as i32);
-        let boxed = planes.address_of(PLANES.boxed * pixels);
-        let mut call = gpu.work().launch_builder(&self.errors);
-        call.arg(&argument).arg(&boxed).arg(&radius).arg(&floor).arg(&added);
-        // SAFETY: the arguments of the kernels; the planes are those of `combine`, for the same picture.
-        unsafe {
-            self.box_rows(argument.squared, boxed, size, radius)?;
-            launch(&mut call, box_columns(size))?;
-        }
+        let gpu = self.gpu.clone();
         let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
         let Some(film) = Arc::get_mut(&mut film.film) else { return refused("a film that is shown already") };
-        if [film.width, film.height] != size {
+        if [film.width, film.height] != size || tiles.len() != size[0].div_ceil(TILE) * size[1].div_ceil(TILE) {
             return refused("a film of another size");
         }
+        tile_errors.write(tiles)?;
+        let mut call = gpu.work().launch_builder(&self.errors);
+        call.arg(&argument).arg(&marched);
+        // SAFETY: the arguments of `combine_errors`; the film and the errors of the tiles are those of `combine`, for the same picture.
+        unsafe { launch(&mut call, blocks(size[0].div_ceil(32), size[1].div_ceil(8))) }?;
         let at = |plane: usize| argument.film + (plane * pixels * size_of::<f32>()) as u64;
         // SAFETY: the planes hold the film; nothing reads or frees `film` before the copies have ended, below.
         let copied = unsafe { copy_to_host(gpu.work(), at(0), film.rgba.as_flattened_mut()) }.and_then(|()| {

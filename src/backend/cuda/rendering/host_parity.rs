@@ -7,7 +7,7 @@ use crate::cuda::SUM_PLANES;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_render::rng::philox;
 use ridgewatch_render::smooth::{
-    Correction, FIRST_AUDIT_RAY, Guides, LightGrid, LightVolume, Medium, NET, Nodes, PairSums, RaySum, ToLight, ToneMap, combine, smoothed,
+    Correction, FIRST_AUDIT_RAY, Guides, LightGrid, LightVolume, Medium, NET, Nodes, PairSums, RaySum, ToLight, ToneMap, combine, error_at,
 };
 use ridgewatch_render::{CameraSettings, Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
 use std::io::Write;
@@ -306,6 +306,7 @@ fn a_device_agrees() {
     use crate::cuda::{
         CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, PinnedFilm, RayCheck,
     };
+    use ridgewatch_render::smooth::errors_of_tiles;
     let gpu = Gpu::open(0, &GpuSettings { poison: true, ..GpuSettings::default() }).unwrap();
     let (laid, mut march, mut combine) = (DeviceNodes::new(&gpu).unwrap(), GpuMarch::new(&gpu).unwrap(), GpuCombine::new(&gpu).unwrap());
     for case in cases().iter().filter(|case| !case.holes) {
@@ -330,7 +331,7 @@ fn a_device_agrees() {
             let tiles = combine.combine(&input).unwrap();
             assert!(tiles.len() == 6 && tiles.iter().all(|tile| tile.all.pixels == 0.0));
             let mut film = PinnedFilm::new(&gpu, 37, 23);
-            combine.finish(8, 0.0, 0.0, &mut film, false).unwrap();
+            combine.finish(&[[f32::NAN; 2]; 6], 0.0, &mut film, false).unwrap();
             let film = film.film();
             with_medium(renderer, &mut |medium| {
                 let volume = LightVolume::new(medium, case.values, 1);
@@ -380,9 +381,11 @@ fn a_device_agrees() {
         combine.poison().unwrap();
         let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
         let tiles = combine.combine(&input).unwrap();
+        let of_tiles = errors_of_tiles(tiles);
+        assert!(of_tiles.iter().flatten().all(|error| *error > 0.0));
         let measured: f64 = tiles.iter().map(|tile| f64::from(tile.all.squared[0])).sum();
         let mut film = PinnedFilm::new(&gpu, width, height);
-        combine.finish(8, 1e-4, 0.0, &mut film, false).unwrap();
+        combine.finish(&of_tiles, 2e-5, &mut film, false).unwrap();
         let film = film.film();
         if how.is_none() {
             let sum = |(&[red, green, blue, alpha], &ftle): (&[f32; 4], &f32)| {
@@ -395,14 +398,14 @@ fn a_device_agrees() {
         let mean: Vec<f32> = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect();
         let expected: f64 = mean.iter().filter(|e| e.is_finite()).map(|e| f64::from(*e)).sum();
         assert!((measured - expected).abs() <= 1e-3 * expected.abs() + 1e-2, "{correction:?}: {measured} and {expected}");
-        let errors = smoothed(&mean, width, 8);
         for i in 0..width * height {
             for k in 0..3 {
                 let (found, expected) = (film.rgba[i][k] - base[i].radiance[k], combined.correction[i][k]);
                 assert!((found - expected).abs() <= 1e-4, "{correction:?}, pixel {i}: {found} and {expected}");
             }
-            let expected = errors[i].max(1e-4).sqrt();
-            assert!((film.error[i] - expected).abs() <= 1e-4 * (1.0 + expected), "{correction:?}, pixel {i}");
+            let is_lit = film.rgba[i][3] > 0.01;
+            let expected = (error_at(&of_tiles, 10, [i % width, i / width], is_lit) + if is_lit { 2e-5 } else { 0.0 }).sqrt();
+            assert!((film.error[i] - expected).abs() <= 1e-5 * (1.0 + expected), "{correction:?}, pixel {i}");
         }
     }
 }
@@ -444,7 +447,7 @@ fn combined_pictures_agree() {
     for (width, height) in [(150, 141), (530, 24), (13, 150)] {
         for (how, number) in [(Correction::Left, 0), (Correction::Shrunk, 1), (Correction::Summed, 2)] {
             let (pixels, mut sums, rays) = (width * height, some_pairs(width, height), 3.0_f64);
-            let ([contrast, brightness, gamma], lit, floor, added) = ([1.85_f32, 0.75, 1.4], 0.01_f32, 1e-4_f32, 2e-5_f32);
+            let ([contrast, brightness, gamma], lit, march) = ([1.85_f32, 0.75, 1.4], 0.01_f32, 0.2_f32);
             let mut random = uniform(22);
             let base: Vec<[f64; 6]> = (0..pixels)
                 .map(|i| {
@@ -468,11 +471,14 @@ fn combined_pictures_agree() {
             let mut input = bytes(&[width as i32, height as i32, number]);
             input.extend(bytes(&[contrast, brightness, gamma, lit]));
             input.extend(bytes(&[1.0 / rays]));
-            input.extend(bytes(&[floor, added]));
+            input.extend(bytes(&[march]));
             input.extend(bytes(&pair_planes(&sums)));
             for k in 0..6 {
                 input.extend(base.iter().flat_map(|b| b[k].to_ne_bytes()));
             }
+            let across = width.div_ceil(16);
+            let of_tiles: Vec<[f32; 2]> = (0..across * height.div_ceil(16)).map(|_| [random(), 1.0 + random()]).collect();
+            input.extend(bytes(of_tiles.as_flattened()));
             let output = ask("combine", &input);
             let mut output = &output[..];
             let rgba = read::<[f32; 4]>(&mut output, pixels);
@@ -493,8 +499,6 @@ fn combined_pictures_agree() {
             let same = |found: f32, expected: f32, size: f32| {
                 (found.is_nan() && expected.is_nan()) || (found - expected).abs() <= 3e-5 * (size + expected.abs())
             };
-            let mean = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect::<Vec<_>>();
-            let errors = smoothed(&mean, width, 8);
             let mut expected_tiles = vec![[0.0_f64; 23]; tiles.len()];
             for i in 0..pixels {
                 let (b, s) = (base[i], &sums[i]);
@@ -510,9 +514,10 @@ fn combined_pictures_agree() {
                 let mean_ftle = if b[3] > 0.0 { (b[4] / b[3]) as f32 } else { f32::NAN };
                 assert!(same(ftle[i], mean_ftle, 0.0) && same(missing[i], (b[5] / rays) as f32, 0.0), "{what}, pixel {i}");
                 assert_eq!((samples[i], traced[i]), (2.0 * s.pairs() as f32, if s.pairs() > 0 { 1.0 } else { 0.0 }));
-                let expected = (errors[i].max(floor) + added).sqrt();
+                let is_lit = rgba[i][3] > lit;
+                let expected = (error_at(&of_tiles, across, [i % width, i / width], is_lit) + if is_lit { march } else { 0.0 }).sqrt();
                 assert!(same(error[i], expected, 0.3), "{what}, pixel {i}: {} and {expected}", error[i]);
-                let tile = &mut expected_tiles[i / width / 16 * width.div_ceil(16) + i % width / 16];
+                let tile = &mut expected_tiles[i / width / 16 * across + i % width / 16];
                 let tone_map = ToneMap::new([contrast, brightness, gamma].map(f64::from));
                 let [squared, scatter] = combined.squared[i];
                 let radiance: [f32; 3] = std::array::from_fn(|k| rgba[i][k].powi(2));

@@ -13,8 +13,8 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH, MarchControl, Marching,
-    NET, PAIR, PictureError, TileSums, ToneMap,
+    AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, LIGHT_STEPS, LIT, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR, PictureError,
+    TileSums, ToneMap, errors_of_tiles,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use ridgewatch_trust::Gate;
@@ -192,7 +192,7 @@ impl GpuSmooth {
         };
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let mut film = self.spare_film(width, height);
-        let error = loop {
+        let (error, of_tiles) = loop {
             if stats.stopped || round.stop.load(Ordering::Relaxed) {
                 self.shows = None;
                 return Ok(None);
@@ -205,7 +205,7 @@ impl GpuSmooth {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
             match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
-                Marching::Enough => break error,
+                Marching::Enough => break (error, errors_of_tiles(tiles)),
                 Marching::Anew => {
                     // If the preparation fails, the picture starts anew.
                     let shows = self.shows.take();
@@ -216,10 +216,8 @@ impl GpuSmooth {
             }
             marching += self.march(round, renderer, &parameters)?;
         };
-        let march = self.control.error();
-        let floor = if error.is_known() { ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0) } else { 0.0 };
         let shows_march = film.march == self.marches;
-        self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32, &mut film.film, shows_march)?;
+        self.combine.finish(&of_tiles, self.control.error() as f32, &mut film.film, shows_march)?;
         film.march = self.marches;
         let shown = film.film.film().clone();
         if self.films.len() < FILMS {
