@@ -70,7 +70,9 @@ class LiveFrames(anywidget.AnyWidget):
             socket.setsockopt(zmq.RCVHWM, 2)
             socket.setsockopt(zmq.LINGER, 0)
             socket.connect(self.endpoint)
-            socket.subscribe(b"")
+            # Not to what the run is at for long (`work`): no picture comes of that.
+            socket.subscribe(b"frame")
+            socket.subscribe(b"record")
             waiting, sent, heard = None, 0.0, None
             while not self._ended.is_set():
                 if socket.poll(50):

@@ -5,7 +5,7 @@ use super::pixels::{Kept, Pixels};
 use super::received::{Received, decode};
 use super::steering::{Answer, Reach, Wheel};
 use crate::progress;
-use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC};
+use crate::publish::{FRAME_TOPIC, PROTOCOL, RECORD_TOPIC, WORK_TOPIC, WorkMark};
 use bytes::Bytes;
 use ridgewatch_zmtp::{SubscribeError, Subscriber};
 use serde::{Deserialize, Serialize};
@@ -32,7 +32,8 @@ const MAX_BATCH_BYTES: usize = 1 << 20;
 const MAX_CLIENTS: usize = 64;
 /// Shortest time between two attempts to reach the publisher.
 const RECONNECT: Duration = Duration::from_millis(500);
-/// Silence after which a publisher counts as silent, if it is also so many times the usual interval of its records.
+/// Silence after which a publisher counts as silent, if it is also so many times the usual interval of its records. What it said of its work counts
+/// as long.
 const SILENT: Duration = Duration::from_secs(3);
 const SILENT_INTERVALS: u32 = 5;
 /// A run that leaves no mark of progress for so long may hang.
@@ -86,6 +87,8 @@ struct Health {
     is_connected: bool,
     /// Marks of progress of the run, and when there was a new one.
     marks: Option<(u64, Instant)>,
+    /// What a run in another process said of its work, and when.
+    told: Option<(WorkMark, Instant)>,
     /// Why the publisher cannot be followed.
     link_problem: Option<String>,
     /// Why pictures or records cannot be shown.
@@ -155,7 +158,7 @@ struct State<'a> {
     endpoint: &'a str,
     status: Status,
     seconds_since_message: Option<f64>,
-    /// What a run in this process has been at for more than two seconds, in words.
+    /// What the run has been at for more than two seconds, in words.
     #[serde(skip_serializing_if = "Option::is_none")]
     work: Option<String>,
     clients: usize,
@@ -215,9 +218,11 @@ impl Hub {
 
     /// Follows the publisher, and reaches it again when it is lost. Never ends.
     pub async fn follow(&self) {
+        // What a run in this process is at needs no message.
+        let topics: &[&str] = if self.is_beside_run { &[FRAME_TOPIC, RECORD_TOPIC] } else { &[FRAME_TOPIC, RECORD_TOPIC, WORK_TOPIC] };
         loop {
             let begin = tokio::time::Instant::now();
-            match Subscriber::connect(&self.endpoint, &[FRAME_TOPIC, RECORD_TOPIC], MAX_MESSAGE_BYTES).await {
+            match Subscriber::connect(&self.endpoint, topics, MAX_MESSAGE_BYTES).await {
                 Ok(mut subscriber) => {
                     lock(&self.health).connected();
                     let error = loop {
@@ -238,7 +243,7 @@ impl Hub {
     fn lost(&self, error: &SubscribeError) {
         tracing::debug!("{}: {error}", self.endpoint);
         let mut health = lock(&self.health);
-        health.is_connected = false;
+        (health.is_connected, health.told) = (false, None);
         let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused, ErrorKind::UnexpectedEof, ErrorKind::ConnectionReset];
         match error {
             SubscribeError::System(error) if absent.contains(&error.kind()) => {}
@@ -253,10 +258,14 @@ impl Hub {
         let taken = match parts {
             [topic, record] if topic == RECORD_TOPIC => self.take_record(record),
             [topic, header, picture] if topic == FRAME_TOPIC => self.take_picture(header, picture).await,
-            _ => Err(format!("a message of {} parts; accepted: frame (3 parts) and record (2 parts)", parts.len())),
+            [topic, mark] if topic == WORK_TOPIC => self.take_work(mark),
+            _ => Err(format!("a message of {} parts; accepted: frame (3 parts), record and work (2 parts)", parts.len())),
         };
         let mut health = lock(&self.health);
-        health.last_message = Some(Instant::now());
+        // A run that is at work for long says so and has no frame meanwhile.
+        if parts.first().is_some_and(|topic| topic != WORK_TOPIC) {
+            health.last_message = Some(Instant::now());
+        }
         if let Err(problem) = taken {
             health.problem = Some(short(&problem));
         }
@@ -281,15 +290,14 @@ impl Hub {
         Ok(())
     }
 
+    fn take_work(&self, json: &[u8]) -> Result<(), String> {
+        let (_, mark): (_, WorkMark) = checked(understood(json)?.as_bytes())?;
+        lock(&self.health).told = Some((WorkMark { work: mark.work.as_deref().map(short), ..mark }, Instant::now()));
+        Ok(())
+    }
+
     async fn take_picture(&self, given: &Bytes, picture: &Bytes) -> Result<(), String> {
-        #[derive(Deserialize)]
-        struct Protocol {
-            protocol: u32,
-        }
-        let (header, Protocol { protocol }) = checked(given)?;
-        if protocol != PROTOCOL {
-            return Err(format!("the publisher speaks protocol {protocol}; accepted: {PROTOCOL}"));
-        }
+        let header = understood(given)?;
         let (_, Head { encoding, payload_bytes }) = checked(header.as_bytes())?;
         if !["jpeg", "png", "exr"].contains(&encoding.as_str()) {
             return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg, png and exr (publish.payload)"));
@@ -347,13 +355,15 @@ impl Hub {
         let clients = lock(&self.clients).there.len();
         let mut health = lock(&self.health);
         let silence = health.last_message.map(|last| last.elapsed());
-        let is_at_work = self.is_beside_run && health.has_new_marks(progress::marks());
-        let work = if self.is_beside_run { progress::work().map(|words| short(&words)) } else { None };
+        let now = Instant::now();
+        let (work, marks) =
+            if self.is_beside_run { (progress::work().map(|words| short(&words)), progress::marks()) } else { health.told_work(now) };
+        let is_at_work = health.has_new_marks(marks, now) && work.is_some();
         let state = State {
             kind: "state",
             endpoint: &self.endpoint,
             // A run at work is not lost, unless it hangs.
-            status: if work.is_some() && is_at_work { health.status(silence).unless_silent() } else { health.status(silence) },
+            status: if is_at_work { health.status(silence).unless_silent() } else { health.status(silence) },
             seconds_since_message: silence.map(|silence| silence.as_secs_f64()),
             work,
             clients,
@@ -370,13 +380,21 @@ impl Hub {
 
 impl Health {
     /// Whether the run left marks within the last while.
-    fn has_new_marks(&mut self, marks: u64) -> bool {
-        let (_, since) = *self.marks.get_or_insert((marks, Instant::now()));
-        if self.marks.is_some_and(|(before, _)| before != marks) {
-            self.marks = Some((marks, Instant::now()));
+    fn has_new_marks(&mut self, marks: u64, now: Instant) -> bool {
+        let (before, since) = *self.marks.get_or_insert((marks, now));
+        if before != marks {
+            self.marks = Some((marks, now));
             return true;
         }
-        since.elapsed() < HANGS
+        now.saturating_duration_since(since) < HANGS
+    }
+
+    /// What a run in another process is at, and its marks of progress. `None` if it has not said so of late.
+    fn told_work(&self, now: Instant) -> (Option<String>, u64) {
+        match &self.told {
+            Some((mark, told)) if now.saturating_duration_since(*told) <= SILENT => (mark.work.clone(), mark.marks),
+            _ => (None, 0),
+        }
     }
 
     /// Another run may have other intervals.
@@ -441,6 +459,18 @@ pub(super) fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str
     Ok((text, serde_json::from_str(text).map_err(|error| fault(&error))?))
 }
 
+/// JSON that says to be of the protocol that is spoken here.
+fn understood(json: &[u8]) -> Result<&str, String> {
+    #[derive(Deserialize)]
+    struct Protocol {
+        protocol: u32,
+    }
+    match checked(json)? {
+        (text, Protocol { protocol: PROTOCOL }) => Ok(text),
+        (_, Protocol { protocol }) => Err(format!("the publisher speaks protocol {protocol}; accepted: {PROTOCOL}")),
+    }
+}
+
 /// Message with the answer to a command.
 pub(super) fn answer(number: u64, answer: &Answer) -> Bytes {
     #[derive(Serialize)]
@@ -503,6 +533,19 @@ mod tests {
         assert!(left(&hub).contains(&latest.number) && !left(&hub).contains(&steering.number));
         drop((steering, watching, more, late));
         assert_eq!(left(&hub).len(), 2);
+    }
+
+    #[test]
+    fn a_run_that_leaves_no_mark_for_a_minute_may_hang_and_words_of_another_process_go_stale() {
+        let (mut health, begin) = (Health::default(), Instant::now());
+        let after = |seconds| begin + Duration::from_secs(seconds);
+        assert!(health.has_new_marks(7, begin) && health.has_new_marks(7, after(59)));
+        assert!(!health.has_new_marks(7, after(60)));
+        assert!(health.has_new_marks(8, after(61)) && health.has_new_marks(8, after(120)) && !health.has_new_marks(8, after(121)));
+        assert_eq!(health.told_work(begin), (None, 0));
+        health.told = Some((WorkMark { protocol: PROTOCOL, work: Some("tracing".to_owned()), marks: 9 }, begin));
+        assert_eq!(health.told_work(after(3)), (Some("tracing".to_owned()), 9));
+        assert_eq!(health.told_work(after(4)), (None, 0));
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use super::exr::encode_exr;
 use super::preview::{jpeg, png, raw};
 use super::settings::Payload;
+use crate::progress;
 use crate::run::{ColorBar, Frame, FrameRecord};
 use serde::{Deserialize, Serialize};
 
@@ -10,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub const FRAME_TOPIC: &str = "frame";
 /// First part of a message with a record alone.
 pub const RECORD_TOPIC: &str = "record";
+/// First part of a message about work that takes long.
+pub const WORK_TOPIC: &str = "work";
 /// Version of the messages; raised when a client would have to change.
 pub const PROTOCOL: u32 = 3;
 
@@ -35,6 +38,24 @@ pub struct FrameHeader {
     pub color_bar: Option<ColorBar>,
     /// Record of the frame.
     pub record: FrameRecord,
+}
+
+/// Second part of a `work` message, as JSON.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkMark {
+    /// [`PROTOCOL`].
+    pub protocol: u32,
+    /// What the run has been at for more than two seconds, in words. `None`: nothing.
+    pub work: Option<String>,
+    /// Signs of progress since the start: if there are no new ones, the run may hang.
+    pub marks: u64,
+}
+
+impl WorkMark {
+    /// Of this process, now.
+    pub(super) fn now() -> Self {
+        Self { protocol: PROTOCOL, work: progress::work(), marks: progress::marks() }
+    }
 }
 
 /// Encodes the picture; returns its header as JSON, and the payload.

@@ -29,7 +29,7 @@ pub use error::PublishError;
 pub use export::{Field, FieldExport, FieldFormat, FieldFrame, MapAbout, NewestSlide, NoField, SeedField, SlideField, seeds};
 pub use exr::{channels_at, decode_exr, encode_exr, exr_claims, read_exr, write_exr};
 pub use histogram::{Histogram, histogram};
-pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
+pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC, WORK_TOPIC, WorkMark};
 pub use movie::{Filmed, Movie, MovieSettings};
 pub use newest::{NewestFrame, NoFrame};
 pub use output::Output;

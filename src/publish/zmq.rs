@@ -4,7 +4,7 @@
 //! which is the crate `ridgewatch-zmtp`.
 
 use super::error::PublishError;
-use super::message::{FRAME_TOPIC, RECORD_TOPIC, encode_frame};
+use super::message::{FRAME_TOPIC, RECORD_TOPIC, WORK_TOPIC, WorkMark, encode_frame};
 use super::settings::{DEFAULT_ENDPOINT, Payload, PublishSettings};
 use super::summary::PublishStatistics;
 use crate::run::{Frame, FrameRecord};
@@ -18,6 +18,8 @@ use std::time::{Duration, Instant};
 const MAX_RECORDS: usize = 256;
 /// Longest wait for room in the socket, after which records are looked at again.
 const TICK: Duration = Duration::from_millis(20);
+/// Interval at which it is told what the run is at.
+const TELL: Duration = Duration::from_secs(1);
 
 /// Publishes frames until [`Publisher::finish`].
 #[derive(Debug)]
@@ -57,7 +59,8 @@ impl Publisher {
         let bound = PubSocket::bind(&endpoint, settings.peers.map(Into::into), limits);
         let socket = Arc::new(bound.map_err(|error| PublishError::of_bind(&endpoint, error))?);
         let mailbox = Arc::new(Mailbox::default());
-        let worker = Worker { mailbox: Arc::clone(&mailbox), socket: Arc::clone(&socket), payload: settings.payload, said: (0, 0) };
+        let (theirs, payload) = ((Arc::clone(&mailbox), Arc::clone(&socket)), settings.payload);
+        let worker = Worker { mailbox: theirs.0, socket: theirs.1, payload, said: (0, 0), told: None, is_at_work: false };
         let name = "ridgewatch-publish";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
@@ -143,10 +146,10 @@ impl Mailbox {
         self.changed.notify_all();
     }
 
-    /// Waits until there is something to do.
+    /// Waits until there is something to do, at most until the work of the run is to be told again.
     fn wait(&self) -> MutexGuard<'_, State> {
         let idle = |state: &mut State| state.frame.is_none() && state.records.is_empty() && state.close_by.is_none();
-        self.changed.wait_while(self.lock(), idle).unwrap_or_else(PoisonError::into_inner)
+        self.changed.wait_timeout_while(self.lock(), TELL, idle).unwrap_or_else(PoisonError::into_inner).0
     }
 }
 
@@ -157,6 +160,10 @@ struct Worker {
     payload: Payload,
     /// Stalled subscribers and refused connections that were warned about.
     said: (u64, u64),
+    /// When the work of the run was last told.
+    told: Option<Instant>,
+    /// Whether it was told to be at any.
+    is_at_work: bool,
 }
 
 impl Worker {
@@ -178,6 +185,7 @@ impl Worker {
                 let newest = self.mailbox.lock().frame.take();
                 newest.iter().for_each(|frame| self.send_picture(frame));
             }
+            self.tell_work();
             self.warn();
             if done.is_some() {
                 return;
@@ -215,6 +223,23 @@ impl Worker {
                 statistics.failed += 1;
                 tracing::warn!("frame {} was not published: {error}", frame.record.frame);
             }
+        }
+    }
+
+    /// Tells what the run is at while it takes long, each second, and once that it is over.
+    fn tell_work(&mut self) {
+        let is_early = self.told.is_some_and(|told| told.elapsed() < TELL);
+        if is_early || !self.socket.is_wanted(WORK_TOPIC.as_bytes()) {
+            return;
+        }
+        let mark = WorkMark::now();
+        if mark.work.is_none() && !self.is_at_work {
+            return;
+        }
+        (self.told, self.is_at_work) = (Some(Instant::now()), mark.work.is_some());
+        match serde_json::to_vec(&mark) {
+            Ok(json) => self.socket.send(&[WORK_TOPIC.as_bytes()], json, Keep::Note),
+            Err(error) => tracing::warn!("the work of the run was not published: {error}"),
         }
     }
 

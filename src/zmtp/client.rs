@@ -155,7 +155,7 @@ impl Client {
                 }
                 outbox.all.push_back(Arc::clone(message));
             }
-            Keep::Newest => {
+            Keep::Newest | Keep::Note => {
                 outbox.newest.retain(|older| older.topic != message.topic);
                 outbox.newest.push(Arc::clone(message));
             }
@@ -266,7 +266,7 @@ impl Outbox {
             Due::Message(message)
         } else if !self.newest.is_empty() {
             let message = self.newest.remove(0);
-            self.writing = Some((message.number, Instant::now()));
+            self.writing = (message.keep == Keep::Newest).then(|| (message.number, Instant::now()));
             Due::Message(message)
         } else if self.last {
             Due::End
@@ -371,6 +371,22 @@ mod tests {
         assert!(ledger.wait_below(1, Duration::ZERO));
         // Two of topic b that were held longest, then all that wait, a kilobyte at most.
         assert!((1..1000).contains(&ledger.peak_bytes()));
+    }
+
+    #[test]
+    fn the_newest_note_of_a_topic_replaces_the_one_that_waits_and_is_not_in_flight() {
+        let (client, ledger) = (subscriber(&["a", "b"]), Arc::new(Ledger::default()));
+        client.give(&ledger.message(&[b"a"], vec![0], Keep::Newest), 2);
+        for last in [1, 2] {
+            client.give(&ledger.message(&[b"b"], vec![last], Keep::Note), 2);
+        }
+        assert!(ledger.wait_below(2, Duration::ZERO), "one message is in flight");
+        let mut outbox = lock(&client.outbox);
+        let Due::Message(picture) = outbox.take() else { panic!("no message") };
+        assert!(picture.last == [0] && outbox.writing.is_some());
+        let Due::Message(note) = outbox.take() else { panic!("no note") };
+        assert!(note.last == [2] && outbox.writing.is_none(), "whoever takes a note slowly holds no place of a picture");
+        assert!(matches!(outbox.take(), Due::Nothing));
     }
 
     #[test]

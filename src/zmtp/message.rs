@@ -10,6 +10,8 @@ use std::time::Duration;
 pub enum Keep {
     /// The next one replaces it.
     Newest,
+    /// The next one replaces it. It is small, and does not count among the messages in flight.
+    Note,
     /// Both wait, up to [`crate::Limits::queued`] messages; then the oldest is dropped.
     All,
 }

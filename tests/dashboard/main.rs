@@ -402,6 +402,7 @@ fn messages_that_are_not_understood_are_told_and_cost_nothing() {
         (vec![b"frame".to_vec(), vec![b' '; 300_000]], "JSON of 300000 bytes"),
         (vec![b"frame".to_vec()], "a message of 2 parts"),
         (vec![b"record".to_vec()], "not understood"),
+        (vec![b"work".to_vec()], "not understood"),
     ] {
         let parts: Vec<&[u8]> = parts.iter().map(Vec::as_slice).collect();
         publisher.send(&parts, b"abc".to_vec(), Keep::All);

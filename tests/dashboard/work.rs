@@ -5,7 +5,10 @@ use crate::kit::scene::{self, SMALL_NETWORK, double_gyre};
 use crate::program::{parts, url};
 use crate::visitor::Visitor;
 use crate::{Stage, raw_publisher, values};
+use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token};
 use ridgewatch::progress::Work;
+use ridgewatch_zmtp::Keep;
+use serde_json::{Value, json};
 use std::time::{Duration, Instant};
 
 const TRACING: &str = "tracing the table of this test";
@@ -17,7 +20,7 @@ fn the_page_of_a_run_is_told_its_work_and_the_time_left_and_is_not_silent_meanwh
     let apart = Stage::new();
     let mut visitor = stage.visit();
     let _publisher = raw_publisher(&stage, &mut visitor);
-    let tells = |state: &serde_json::Value| state["work"].as_str().is_some_and(|work| work.starts_with(TRACING));
+    let tells = |state: &Value| state["work"].as_str().is_some_and(|work| work.starts_with(TRACING));
     let work = Work::begun(TRACING, Instant::now() - Duration::from_secs(3));
     work.reached(1, 4);
     let state = visitor.until_state(tells);
@@ -26,14 +29,34 @@ fn the_page_of_a_run_is_told_its_work_and_the_time_left_and_is_not_silent_meanwh
     let state = visitor.until_state(|state| tells(state) && state["seconds_since_message"].as_f64().unwrap() > 4.0);
     assert_eq!(state["status"], "following");
     let state = apart.visit().until_state(|_| true);
-    assert!(state["work"].is_null(), "the run of another process: {state}");
+    assert!(state["work"].is_null(), "no run is there: {state}");
     drop(work);
     visitor.until_state(|state| !tells(state));
     visitor.until_state(|state| state["work"].is_null() && state["status"] == "silent");
 }
 
+/// A run in another process tells it by messages.
 #[test]
-fn a_run_tells_its_page_how_far_a_frame_a_target_and_training_are() {
+fn a_page_apart_from_the_run_is_told_its_work_by_messages_and_is_not_silent_meanwhile() {
+    let stage = Stage::new();
+    let mut visitor = stage.visit();
+    let publisher = raw_publisher(&stage, &mut visitor);
+    let words = format!("{TRACING}: 25 %, about 9 s left, {}", "a".repeat(1000));
+    let tell = |marks: u32| {
+        let mark = json!({"protocol": 3, "work": words, "marks": marks}).to_string();
+        publisher.send(&[b"work"], mark.into_bytes(), Keep::Note);
+        std::thread::sleep(Duration::from_millis(300));
+    };
+    std::thread::scope(|scope| {
+        scope.spawn(|| (0..25).for_each(tell));
+        let state = visitor.until_state(|state| state["seconds_since_message"].as_f64().unwrap() > 4.0);
+        assert_eq!((&state["work"], &state["status"]), (&json!(words[..300]), &json!("following")), "{state}");
+    });
+    visitor.until_state(|state| state["work"].is_null() && state["status"] == "silent");
+}
+
+#[test]
+fn a_run_tells_its_page_and_one_apart_how_far_a_frame_a_target_and_training_are() {
     let folder = tempfile::tempdir().unwrap();
     let common = "time.tau = 10\ntime.slides = 1\nflow.steps = 20\n";
     let network =
@@ -58,9 +81,14 @@ fn a_run_tells_its_page_how_far_a_frame_a_target_and_training_are() {
         command.args(["--out", text(&run.join("run"))]).args(set(&["publish.preview=false", "publish.exr=\"none\""]));
         let running = start(&mut command);
         let (address, token) = parts(&url(&running));
-        let state = Visitor::open(address, &token)
-            .until_state(|state| state["work"].as_str().is_some_and(|work| work.starts_with(begin) && work.contains(part)));
-        assert!(state["work"].as_str().unwrap().ends_with(" left"), "{state}");
+        let apart = Token::random().unwrap();
+        let secret = apart.secret().to_owned();
+        let apart = Dashboard::start(DashboardSettings::local(endpoint.clone(), Some(0), apart)).unwrap();
+        for (address, token) in [(address, token), (apart.address(), secret)] {
+            let state = Visitor::open(address, &token)
+                .until_state(|state| state["work"].as_str().is_some_and(|work| work.starts_with(begin) && work.contains(part)));
+            assert!(state["work"].as_str().unwrap().ends_with(" left"), "{state}");
+        }
         running.signal(libc::SIGTERM);
         running.wait();
     }

@@ -1,13 +1,15 @@
 //! Frames through a real socket.
 
 use crate::kit::publishing::{self, GREETING};
+use ridgewatch::progress::Work;
 use ridgewatch::publish::{
-    FRAME_TOPIC, FrameHeader, Output, Payload, PublishError, PublishSettings, Publisher, RECORD_TOPIC, RunFolder, Summary, decode_exr,
+    FRAME_TOPIC, FrameHeader, Output, PROTOCOL, Payload, PublishError, PublishSettings, Publisher, RECORD_TOPIC, RunFolder, Summary,
+    WORK_TOPIC, WorkMark, decode_exr,
 };
 use ridgewatch::render::Film;
 use ridgewatch::run::{Frame, FrameRecord};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};
 
 /// Longer than anything here takes on a busy machine, so that a test that hangs fails.
@@ -114,6 +116,40 @@ async fn every_record_arrives_though_pictures_are_superseded() {
     assert!(numbers.len() >= 99 && numbers.windows(2).all(|pair| pair[1] == pair[0] + 1), "{numbers:?}");
     let statistics = publisher.finish(LIMIT);
     assert!(statistics.superseded > 0 && statistics.records_dropped == 0, "{statistics:?}");
+}
+
+fn work_mark(message: &ZmqMessage) -> WorkMark {
+    assert_eq!((message.len(), message.get(0).unwrap().as_ref()), (2, WORK_TOPIC.as_bytes()));
+    serde_json::from_slice(message.get(1).unwrap()).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_takes_long_is_told_each_second_and_once_that_it_is_over() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
+    let mut socket = subscribe(publisher.endpoint(), &[WORK_TOPIC]).await;
+    let begin = Instant::now();
+    let work = Work::begun("a test", begin - Duration::from_secs(100));
+    let mut marks = 0;
+    for done in 1..=3 {
+        work.reached(done, 4);
+        // One of before may have been on its way.
+        let share = format!("a test: {} %, about ", 25 * done);
+        let mark = loop {
+            let mark = work_mark(&receive(&mut socket).await);
+            if mark.work.as_deref().is_some_and(|words| words.starts_with(&share)) {
+                break mark;
+            }
+        };
+        assert!(mark.protocol == PROTOCOL && mark.marks > marks, "{mark:?} after {marks}");
+        marks = mark.marks;
+    }
+    assert!(begin.elapsed() >= Duration::from_secs(2), "three in {:?}", begin.elapsed());
+    drop(work);
+    while work_mark(&receive(&mut socket).await).work.is_some() {}
+    if let Ok(message) = tokio::time::timeout(Duration::from_millis(2500), socket.recv()).await {
+        let mark = work_mark(&message.unwrap());
+        assert!(mark.work.is_some(), "of another test, or it is told twice that it is over: {mark:?}");
+    }
 }
 
 /// More strangers than places, from the address of the subscribers or from another. All send the greeting of ZMTP 3 and stay.
