@@ -55,13 +55,14 @@ pub(super) fn named(path: &str) -> Option<File> {
 mod tests {
     use super::*;
     use std::path::Path;
+    use std::process::Command;
 
-    /// Paths of the files in a folder, except notes and licences.
+    /// Paths of the files in a folder, except notes, licences, and what says of which package they are.
     fn paths(folder: &Path, root: &Path) -> Vec<String> {
         let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
         let files = entries
             .flat_map(|path| if path.is_dir() { paths(&path, root) } else { vec![path.strip_prefix(root).unwrap().display().to_string()] });
-        files.filter(|path| ![".md", ".LICENSE"].iter().any(|end| path.ends_with(end))).collect()
+        files.filter(|path| ![".md", ".LICENSE", ".json", "SUMS"].iter().any(|end| path.ends_with(end))).collect()
     }
 
     #[test]
@@ -76,5 +77,23 @@ mod tests {
             assert_eq!(named(&format!("/node/host/8577/{}", file.path)).unwrap().path, file.path);
         }
         assert!(named("/nopage.js").is_none() && named("/../Cargo.toml").is_none());
+    }
+
+    #[test]
+    fn files_of_other_packages_are_unchanged_and_of_the_locked_version() {
+        let vendor = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/dashboard/page/vendor");
+        let read = |name: &str| std::fs::read_to_string(vendor.join(name)).unwrap();
+        let sums = read("SHA512SUMS");
+        let mut named: Vec<_> = sums.lines().filter_map(|line| line.split_whitespace().last()).collect();
+        named.sort_unstable();
+        assert_eq!(named, ["uPlot.LICENSE", "uPlot.esm.js", "uPlot.min.css"]);
+        let checked = Command::new("sha512sum").args(["--check", "--strict", "SHA512SUMS"]).current_dir(&vendor).output().unwrap();
+        assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stdout));
+        let lock: serde_json::Value = serde_json::from_str(&read("package-lock.json")).unwrap();
+        let locked = &lock["packages"]["node_modules/uplot"];
+        let version = locked["version"].as_str().unwrap();
+        assert!(locked["integrity"].as_str().unwrap().starts_with("sha512-"), "{locked}");
+        assert_eq!(lock["packages"][""]["dependencies"]["uplot"], version, "an exact version, not a range");
+        assert!(read("uPlot.esm.js").contains(&format!("(v{version})")) && read("README.md").contains(&format!("| {version} |")));
     }
 }
