@@ -10,7 +10,7 @@ use super::{
     TracedBricks,
 };
 use rayon::prelude::*;
-use ridgewatch_base::progress;
+use ridgewatch_base::progress::{self, Work};
 use ridgewatch_field::{DomainPoint, UnitPoint};
 use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement, own_nodes};
@@ -140,15 +140,19 @@ impl HostPicture {
             progress::mark();
             frame.stop.load(Ordering::Relaxed)
         };
-        let mut values = vec![0.0; shape.iter().product()];
+        let all = shape.iter().product();
+        let mut values = vec![0.0; all];
+        let work = Work::begin("laying the surrogate out on nodes");
         for (part, values) in values.chunks_mut(AT_ONCE).enumerate() {
             if is_stopped() {
                 return Ok(None);
             }
             let first = part * AT_ONCE;
+            work.reached(first, all);
             let points: Vec<UnitPoint> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;
         }
+        drop(work);
         let mut nodes = Nodes::new(shape, Arc::new(values));
         if smooth.traced_nodes > 0 {
             if self.traced.settle(shape) {
@@ -156,7 +160,9 @@ impl HostPicture {
             }
             let next = self.traced.next(nodes.brick_max(), frame.routing.gate, |s| renderer.ramp(s), smooth.traced_nodes);
             let domain = frame.tracer.flow().domain();
-            for bricks in next.chunks(BRICKS_AT_ONCE) {
+            let work = Work::begin("tracing nodes where the surrogate is not trusted");
+            for (part, bricks) in next.chunks(BRICKS_AT_ONCE).enumerate() {
+                work.reached(part * BRICKS_AT_ONCE, next.len());
                 let points: Vec<DomainPoint> = indices(shape, bricks).map(|i| domain.from_unit(Nodes::unit(shape, i))).collect();
                 let mut found = vec![0.0; points.len()];
                 router.trace_nodes(&points, &mut found)?;

@@ -11,6 +11,7 @@ use crate::Smooth;
 use crate::cuda::driver::Gpu;
 use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
+use ridgewatch_base::progress::Work;
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
     AUDIT_PAIRS, AUDIT_STEPS, Allocation, AuditedPixel, LIGHT_STEPS, LIT, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR, PictureError,
@@ -130,6 +131,7 @@ impl GpuSmooth {
         self.shows = None;
         let (width, height) = (scene.settings.width, scene.settings.height);
         if round.table.is_none() {
+            let _work = Work::begin("laying the surrogate out on nodes");
             let domain = round.tracer.host().domain();
             self.nodes.lay_out(round.predictor, round.smooth.nodes, domain.dimensions)?;
             if round.smooth.traced_nodes > 0 {
@@ -244,7 +246,7 @@ impl GpuSmooth {
             return Ok(0.0);
         }
         let due = self.control.next_rays;
-        let began = Instant::now();
+        let (began, _work) = (Instant::now(), Work::begin("marching rays"));
         // If the device fails, the picture starts anew.
         let shows = self.shows.take();
         let medium = medium(&self.nodes, round, parameters)?;
@@ -315,8 +317,11 @@ impl GpuSmooth {
         let cursors: Vec<u16> = plan.iter().map(|tile| u16::from(tile.cursor)).collect();
         let most = plan.iter().map(|tile| tile.pairs).max().unwrap_or(0);
         let mut stats = RenderStats::default();
+        let up_to = |most: usize| plan.iter().map(|tile| tile.pairs.min(most)).sum::<usize>();
+        let (work, all) = (Work::begin("drawing samples"), up_to(most));
         // A tile whose pixels all get a pair ends where it began.
         for first in (0..most).step_by(MAX_PAIRS) {
+            work.reached(up_to(first), all);
             let pairs: Vec<u16> = plan.iter().map(|tile| tile.pairs.saturating_sub(first).min(MAX_PAIRS) as u16).collect();
             let tiles = PairTiles { pairs: &pairs, cursors: &cursors };
             let missing = round.tracer.missing_cells();
