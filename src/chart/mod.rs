@@ -30,7 +30,7 @@ pub use verdict::verdict;
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend as _, BackendError, Cpu, Device};
 use crate::render::Method;
-use crate::run::{MapSettings, RunError, Settings};
+use crate::run::{RunError, Settings};
 use crate::surrogate::Kind;
 use serde::Serialize;
 use slides::FirstSlides;
@@ -213,6 +213,5 @@ fn with_method(settings: &Settings, method: Method, kind: Kind) -> Settings {
         (settings.network.inputs, settings.network.start_range) = (Vec::new(), None);
     }
     settings.training.resume = None;
-    settings.maps = MapSettings::default();
     settings
 }

@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{MapSettings, Race, RunError, Settings, Setup, why_steps};
+use ridgewatch::run::{Race, RunError, Settings, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -185,11 +185,10 @@ pub fn text_with_tau(scene: &SceneFile, setup: &Setup, text: String) -> Result<S
 
 /// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
 pub fn open(scene: &SceneFile) -> Result<Setup> {
-    // Maps of the slides are those of runs.
-    open_by(scene, |settings| Setup::new(Settings { maps: MapSettings::default(), ..settings }))
+    open_by(scene, Setup::new)
 }
 
-/// The same by [`Setup::new`] or [`Setup::following`].
+/// The same by [`Setup::new`] or [`Setup::for_run`].
 pub fn open_by(scene: &SceneFile, set_up: fn(Settings) -> Result<Setup, RunError>) -> Result<Setup> {
     let _spinner = opening(scene);
     set_up(scene.settings()).map_err(|error| located(scene, error, RunError::refused))

@@ -34,7 +34,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let text = scene.to_toml()?;
     let chart = beside_scene(&options.paths, CHART);
     Session { common, options: &options.run, scene, text, follows: None, chart, race }.run(|scene, _| {
-        let mut setup = open_by(scene, Setup::following)?;
+        let mut setup = open_by(scene, Setup::for_run)?;
         setup.earlier_race = earlier;
         Ok(Some(setup))
     })

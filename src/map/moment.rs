@@ -4,7 +4,7 @@ use super::MapError;
 use crate::field::Window;
 use crate::flow::{FlowMap, VelocitySource};
 use crate::render::Method;
-use crate::run::{MapSettings, Plan, Settings, Setup, TimeSpan};
+use crate::run::{Plan, Settings, Setup, TimeSpan};
 use crate::source::SourceKind;
 use crate::surrogate::Kind;
 use std::sync::atomic::AtomicBool;
@@ -37,8 +37,6 @@ impl Moment {
         settings.render.samples = settings.render.samples.ceil().max(1.0);
         (settings.surrogate.kind, settings.surrogate.table_nodes, settings.training.resume) = (Kind::Table, None, None);
         (settings.network.inputs, settings.network.start_range) = (Vec::new(), None);
-        // Those of a run.
-        settings.maps = MapSettings::default();
         let mut values = Vec::new();
         for tau in taus {
             let value = tau.value().filter(|value| value.is_finite() && *value > 0.0);

@@ -67,20 +67,22 @@ impl Setup {
         raced.unwrap_or(self.plan.scene.render.method)
     }
 
-    /// Opens the source and chooses the settings that the scene leaves open. An archive is taken as it is now.
+    /// Opens the source and chooses the settings that the scene leaves open. An archive is taken as it is now, and nothing is held for maps of the
+    /// slides, `[maps]` of the scene.
     ///
     /// # Errors
     /// A setting is not accepted, or the source cannot be opened.
     pub fn new(mut scene: Settings) -> Result<Self, RunError> {
-        scene.archive.follow = None;
-        Self::following(scene)
+        (scene.archive.follow, scene.maps) = (None, MapSettings::default());
+        Self::for_run(scene)
     }
 
-    /// The same, and an archive is followed if the scene says so: its slides may wait for snapshots that come.
+    /// The same with what only runs have: maps of their slides, and an archive that is followed if the scene says so, whose slides may wait for
+    /// snapshots that come.
     ///
     /// # Errors
     /// As for [`Self::new`].
-    pub fn following(scene: Settings) -> Result<Self, RunError> {
+    pub fn for_run(scene: Settings) -> Result<Self, RunError> {
         scene.check()?;
         let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
         Self::settle(scene, snapshots, None)
