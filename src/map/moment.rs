@@ -17,7 +17,7 @@ pub struct Moment {
     pub velocity: VelocitySource,
     /// Seed time.
     pub time: f64,
-    /// `time` as a date; `None` if the source has no calendar or no snapshot at that time.
+    /// `time` as a date; `None` if the source has no calendar, or counts snapshots and has none at that time.
     pub date: Option<String>,
     /// |tau| of each panel, in time units.
     pub taus: Vec<f64>,
@@ -75,7 +75,7 @@ impl Moment {
             && let Some(seed) = seed_of_both(window, tau)
         {
             time = seed;
-            date = slides.date(time);
+            date = slides.date(time).or_else(|| setup.plan.georeference.date(time));
         }
         let taus = if values.is_empty() { vec![tau] } else { values };
         Ok(Self { plan: setup.plan, velocity: slide.velocity, time, date, taus, notes })

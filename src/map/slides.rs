@@ -147,7 +147,8 @@ impl SlideMaps {
             }
             self.is_apart = false;
             time = seed_of_both(&self.past, tau)?;
-            date = self.dates.iter().find(|(known, _)| *known == time).and_then(|(_, date)| date.clone());
+            let of_slide = self.dates.iter().find(|(known, _)| *known == time).and_then(|(_, date)| date.clone());
+            date = of_slide.or_else(|| plan.georeference.date(time));
             velocity = VelocitySource::Window(Arc::new(self.past.clone()));
         }
         Some(Moment { plan, velocity, time, date, taus: vec![tau], notes: Vec::new() })

@@ -1,6 +1,7 @@
 //! Names and meaning of a source's coordinates, for fields that are exported on its grid (CF conventions, chapters 4 and 5).
 
 use crate::archive_settings::{ArchiveSettings, Metric};
+use crate::cf::calendar::Calendar;
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
 use crate::formats::{Attribute, DataFile, Variable};
@@ -252,6 +253,11 @@ fn between(nodes: &[f64], value: f64) -> Option<(usize, f64)> {
 }
 
 impl Georeference {
+    /// A time, in seconds, as a date (`2002-01-01T00:00:00Z`), whether or not a snapshot has it; `None` if times are no dates.
+    pub fn date(&self, time: f64) -> Option<String> {
+        Calendar::parse(self.calendar?)?.iso(time)
+    }
+
     /// Of the first file of an archive.
     pub(crate) fn of(file: &DataFile, layout: &Layout, settings: &ArchiveSettings) -> Self {
         let listing = &file.listing;
@@ -355,6 +361,14 @@ mod tests {
         assert_eq!(positions.at(0.5, 1.0), Some([180.0, 12.5]));
         assert_eq!(positions.at(1.0, 4.0), Some([-179.0, 20.0]));
         assert_eq!((positions.at(1.5, 1.0), positions.at(-0.1, 1.0), positions.at(0.0, f64::NAN)), (None, None, None));
+    }
+
+    #[test]
+    fn any_time_of_a_calendar_has_a_date() {
+        let of = |calendar| Georeference { calendar, ..Georeference::default() }.date(1_009_908_000.0);
+        assert_eq!(of(Some("standard")).as_deref(), Some("2002-01-01T18:00:00Z"));
+        assert_eq!(of(Some("360_day")).as_deref(), Some("2002-06-19T18:00:00Z"));
+        assert_eq!(of(None), None, "times that are counted have none");
     }
 
     #[test]

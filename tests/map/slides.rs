@@ -141,6 +141,23 @@ fn both_directions_of_an_archive_begin_when_twice_tau_is_known() {
 }
 
 #[test]
+fn both_directions_of_a_time_that_no_slide_has_are_dated() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = ocean(folder.path());
+    // Snapshots are twelve hours apart: the middle of 36 hours lies between two of them.
+    let out = folder.path().join("between");
+    replay(text(&data), &out, &["time.tau=\"18 hours\"", "time.slides=2", "maps.both=true"], &[]);
+    let between = out.join("maps/slide_000001.png");
+    assert_eq!(json(&between.with_extension("json"))["date"], "2002-01-01T18:00:00Z");
+    same_as_alone(folder.path(), &between, &[text(&data), "--tau", "18 hours", "--both"]);
+    // Backward, a slide has the time of its window's newest snapshot: that in the middle of 72 hours is of no slide, as every second one.
+    let out = folder.path().join("backward");
+    let keys = ["time.tau=\"36 hours\"", "time.slides=3", "time.direction=backward", "time.snapshots_per_slide=2", "maps.both=true"];
+    replay(text(&data), &out, &keys, &[]);
+    assert_eq!(json(&out.join("maps/slide_000002.json"))["date"], "2002-01-03T00:00:00Z");
+}
+
+#[test]
 fn keys_of_maps_that_do_nothing_are_told() {
     let folder = tempfile::tempdir().unwrap();
     let (out, gyre) = (folder.path().join("run"), config("double_gyre.toml"));
