@@ -3,6 +3,7 @@
 use crate::network_support::{DoubleGyre, traced, uniform_points};
 use crate::page;
 use ridgewatch::flow::Tracer;
+use ridgewatch::publish::{PROTOCOL, WorkMark};
 use ridgewatch::render::smooth::PictureError;
 use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
@@ -39,6 +40,13 @@ fn the_page_names_every_key_of_a_record_and_no_other() {
     assert_eq!(paragraph("`training`:"), keys(&Learned::default()));
     assert_eq!(paragraph("`checkpoint`:"), keys(&CheckpointRecord::default()));
     assert_eq!(paragraph("`seconds`:"), keys(&StageSeconds::default()));
+}
+
+#[test]
+fn the_page_names_every_key_of_a_message_about_work() {
+    let page = page("protocol.md");
+    let section = page.split("### `work`\n").nth(1).unwrap().split("\n### ").next().unwrap();
+    assert_eq!(quoted(section, true), keys(&WorkMark { protocol: PROTOCOL, work: None, marks: 0 }));
 }
 
 #[test]
