@@ -95,6 +95,7 @@ impl Run<'_> {
             let evidence = learning.trust.weigh(&error);
             record.gate_evidence = Some(evidence);
             if evidence >= REJECTED {
+                learning.need.restart();
                 record.warnings.push(format!(
                     "the error of the colours (optical residual) where the surrogate is trusted was above `trust.tolerance` over the last \
                      frames (evidence {evidence:.0}, limit {REJECTED}): every cell must earn trust again"
@@ -112,6 +113,7 @@ impl Run<'_> {
                  trust.audit_min_per_cell and trust.audit_share draw more"
             ));
         }
+        learning.need.trusts(trusted_volume);
         learning.trust.decay();
         learning.trust.observe(Some(audited), &rendered);
         if let Some(sizing) = &mut learning.sizing {

@@ -1,7 +1,7 @@
 //! The cycle: slide the window, render with the weights of the previous cycle, test, then train.
 //!
 //! One group of threads renders frame n with frozen weights, while another trains the live weights on the samples of earlier frames. A GPU that
-//! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
+//! trains alternates between picture and training, which takes `training.share` of the device's time while the loss falls. Samples traced for frame n are compared
 //! with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
 use super::budget::FrameCost;
@@ -9,6 +9,7 @@ use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
 use super::decision::{Decision, enter_colours, suited_network, why_steps};
 use super::integration::integration_warnings;
+use super::need::Need;
 use super::prepare::FLOW_MAP;
 use super::race::{Pace, Race, Races};
 use super::record::Frame;
@@ -209,6 +210,8 @@ pub(super) struct Learning {
     pub(super) resize: Option<Resize>,
     /// Device time due to training beside a live simulation.
     pub(super) budget: TrainingBudget,
+    /// How much training is needed.
+    pub(super) need: Need,
     /// Training after the last frame went out, or in a frame that failed. It goes into the next record.
     pub(super) unreported: Learned,
     /// Largest log-stretch on the audit points of this slide.
@@ -541,6 +544,7 @@ impl<'a> Run<'a> {
             sizing,
             resize: None,
             budget: TrainingBudget::new(scene.training.share),
+            need: Need::default(),
             unreported: Learned::default(),
             peak: f32::NEG_INFINITY,
         };

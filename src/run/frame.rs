@@ -3,7 +3,7 @@
 use super::assess::{Work, assess};
 use super::budget::FrameCost;
 use super::checkpoints::Checkpoints;
-use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
+use super::cycle::{Event, FramePlace, Learning, Run, Sink, fixed_steps};
 use super::decision::cpu_batch;
 use super::record::{DomainRecord, Frame};
 use super::setup::Plan;
@@ -42,6 +42,8 @@ struct Picture<'a> {
     gate: &'a Gate,
     place: FramePlace,
     is_live: bool,
+    /// How much training is needed; `None` if the surrogate does not learn, or as long as is given.
+    need: Option<f64>,
 }
 
 impl Run<'_> {
@@ -62,7 +64,8 @@ impl Run<'_> {
         let serves = on.surrogate.as_ref().filter(|_| method.has_surrogate());
         let frozen = serves.map(Surrogate::freeze).transpose()?;
         let renderer = self.renderer.clone();
-        let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
+        let need = self.training_need(on);
+        let picture = Picture { gate: &gate, place, is_live: slide.live.is_some(), need };
         let computed = self.picture(on, frozen.as_ref(), &picture, sink).and_then(|work| {
             let assessing = Instant::now();
             let assessment = match &frozen {
@@ -112,6 +115,7 @@ impl Run<'_> {
             }
         }
         record.training = learned;
+        record.training_need = need;
         record.replay_samples = self.learning.buffer.len() as u64;
         record.checkpoint = self.checkpoints.as_mut().and_then(Checkpoints::look);
         if let Some(failed) = record.checkpoint.as_ref().and_then(|checkpoint| checkpoint.failed.as_ref()) {
@@ -160,6 +164,14 @@ impl Run<'_> {
         }
     }
 
+    /// Factor on the time of training. `None` if the surrogate does not learn, or if the scene gives the time.
+    fn training_need<B: Backend>(&self, on: &On<B>) -> Option<f64> {
+        let learns = |surrogate: &&B::Surrogate| self.render.method.has_surrogate() && surrogate.learns();
+        let surrogate = on.surrogate.as_ref().filter(learns)?;
+        let is_constant = self.plan.scene.training.is_constant(surrogate.trains_on_device());
+        (!is_constant).then(|| self.learning.need.factor())
+    }
+
     /// Settings of a frame of so many samples a pixel whose picture accumulates; `None` for other methods.
     pub(super) fn smooth<B: Backend>(
         &self,
@@ -196,11 +208,14 @@ impl Run<'_> {
         picture: &Picture<'_>,
         sink: &mut Sink<'_>,
     ) -> Result<Work<B::Samples>, RunEnd> {
-        self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
+        let device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
+        let factor = picture.need.unwrap_or(1.0);
+        // Threads that would idle for most of the picture render it.
+        self.threads.take_turns = device_trains || factor < 1.0;
         let method = self.render.method;
         let (serves, is_smooth) = (method.has_surrogate(), method.is_smooth());
         let learns = serves && on.surrogate.as_ref().is_some_and(Surrogate::learns);
-        if learns && !self.threads.device_trains {
+        if learns && !device_trains {
             self.progress.warnings.extend(cpu_batch(&mut self.learning.network, &mut self.report.decisions));
         }
         // A smooth picture measures its own error, so that labels of a table have no use.
@@ -229,6 +244,7 @@ impl Run<'_> {
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
+        let need = &mut self.learning.need;
         let (renderer, frame, stop, abandon) = (&mut self.renderer, self.progress.frame, self.stop, &*self.options.abandon);
         // Before training begins beside it.
         let mut drawing = Some(InProgress::begin("rendering the frame"));
@@ -275,13 +291,13 @@ impl Run<'_> {
                 let (rendered, learned) = (&rendered, &mut learned);
                 let training = std::thread::Builder::new().spawn_scoped(scope, move || {
                     let mut learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
-                    beside.install(|| train(&mut learn, settings, Until::Rendered(rendered), stop, learned))?;
-                    let left = settings.seconds() - learned.seconds;
+                    beside.install(|| train(&mut learn, settings, Until::Rendered(rendered), stop, learned, need))?;
+                    let left = settings.seconds(factor) - learned.seconds;
                     if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
                         return Ok(());
                     }
                     // The picture is complete and its threads are idle.
-                    all.install(|| train(&mut learn, settings, Until::Seconds(left), stop, learned))
+                    all.install(|| train(&mut learn, settings, Until::Seconds(left), stop, learned, need))
                 });
                 let work = threads.render().install(&mut render);
                 rendered.store(true, Ordering::Release);
@@ -298,9 +314,11 @@ impl Run<'_> {
                 let work = threads.render().install(&mut render);
                 let mut trained = Ok(());
                 if let (true, Ok(work)) = (waits, &work) {
-                    let seconds = if threads.device_trains { settings.turn(work.device_share()) } else { settings.seconds() };
+                    let due = if device_trains { settings.turn(work.device_share(), factor) } else { settings.seconds(factor) };
+                    let until = Until::Seconds(need.turn(due).max(settings.seconds_per_frame.unwrap_or(0.0)));
                     let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
-                    trained = threads.render().install(|| train(learn, settings, Until::Seconds(seconds), stop, &mut learned));
+                    trained = threads.render().install(|| train(learn, settings, until, stop, &mut learned, need));
+                    need.took(learned.seconds);
                 }
                 (work, trained)
             }
@@ -319,9 +337,9 @@ impl Run<'_> {
 
     /// Trains in a live run after the frame has gone out, until the next window is complete. The CPU trains for at least `training.share` of the
     /// `seconds` that the frame took, so that a fast simulation does not prevent training. A device trains for at most `training.share` of the
-    /// time, since a solver may use it too.
+    /// time, since a solver may use it too. Both are less while the loss has stalled.
     pub(super) fn train_meanwhile<B: Backend>(&mut self, on: &mut On<B>, slides: &dyn Slides, seconds: f64) -> Result<(), RunEnd> {
-        let settings = &self.plan.scene.training;
+        let (settings, factor) = (&self.plan.scene.training, self.training_need(on).unwrap_or(1.0));
         let (Some(_), None) = (slides.is_awaited(), settings.steps_per_frame) else { return Ok(()) };
         let is_awaited = || slides.is_awaited() == Some(true);
         let serves = self.render.method.has_surrogate();
@@ -331,14 +349,14 @@ impl Run<'_> {
         };
         let (begin, _work) = (Instant::now(), InProgress::begin("training until the next window is complete"));
         let (mut trained, mut was_idle) = (0.0, false);
-        while trained < settings.seconds()
+        while trained < settings.seconds(factor)
             && !slides.is_lost()
             && !self.stop.load(Ordering::Relaxed)
             && !self.is_commanded_within(Duration::ZERO)
         {
-            let mut slice = (settings.seconds() - trained).min(TURN);
+            let mut slice = (settings.seconds(factor) - trained).min(TURN);
             if surrogate.trains_on_device() {
-                match self.learning.budget.due(self.began.elapsed().as_secs_f64()) {
+                match self.learning.budget.due(self.began.elapsed().as_secs_f64(), factor) {
                     Some(due) => slice = slice.min(due),
                     None if is_awaited() => {
                         progress::mark();
@@ -347,12 +365,13 @@ impl Run<'_> {
                     }
                     None => break,
                 }
-            } else if begin.elapsed().as_secs_f64() >= settings.share * seconds && !is_awaited() {
+            } else if begin.elapsed().as_secs_f64() >= factor * settings.share * seconds && !is_awaited() {
                 break;
             }
-            let (mut learned, buffer, stop) = (Learned::default(), &self.learning.buffer, self.stop);
+            let (mut learned, stop) = (Learned::default(), self.stop);
+            let Learning { buffer, need, .. } = &mut self.learning;
             let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
-            let result = self.threads.all().install(|| train(learn, settings, Until::Seconds(slice), stop, &mut learned));
+            let result = self.threads.all().install(|| train(learn, settings, Until::Seconds(slice), stop, &mut learned, need));
             trained += learned.seconds;
             self.learning.budget.took(learned.device_seconds.unwrap_or(learned.seconds));
             let is_idle = learned.steps == 0;

@@ -16,6 +16,7 @@ mod error;
 mod frame;
 mod integration;
 mod memory;
+mod need;
 mod prepare;
 mod race;
 mod record;

@@ -55,6 +55,7 @@ impl Run<'_> {
         let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
         check_stop(self.stop)?;
         *surrogate = Some(built);
+        self.learning.need.restart();
         self.progress.surrogate_seconds = begin.elapsed().as_secs_f64();
         self.progress.warnings.extend(backend.warnings());
         Ok(())
@@ -110,6 +111,7 @@ impl Run<'_> {
         learning.trust.window_slid();
         learning.start = flow.start();
         if let Some(share) = share {
+            learning.need.restart();
             learning.buffer.mark_stale();
             learning.buffer.revalidate(share);
         }

@@ -115,6 +115,9 @@ pub struct FrameRecord {
     pub majorant_exceeded: u64,
     /// Training since the last frame.
     pub training: Option<crate::surrogate::Learned>,
+    /// Factor on the time that training takes: 1, or less while its loss has stalled. `None` if nothing is trained, or for a time that is given.
+    #[serde(default)]
+    pub training_need: Option<f64>,
     /// Samples in the replay buffer (`training.replay_buffer`).
     pub replay_samples: u64,
     /// Points that a GPU traced for flights that ended before they reached them; not queries, and not among `traced`.

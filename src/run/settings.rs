@@ -212,10 +212,10 @@ impl TimeSettings {
 #[serde(deny_unknown_fields, default)]
 pub struct TrainingSettings {
     /// On the CPU, share of the threads that train while the others render (at least one thread each; a single thread alternates). On a GPU,
-    /// share of the device's time.
+    /// share of the device's time until the loss has stalled.
     pub share: f64,
     /// Seconds of training a frame: a minimum, for which the next frame waits, and the maximum while waiting for a simulation. `None`: 1 on the
-    /// CPU, given by `share` on a GPU.
+    /// CPU until the loss has stalled, given by `share` on a GPU.
     pub seconds_per_frame: Option<f64>,
     /// Exact number of optimizer steps a frame instead, for reproducible runs.
     pub steps_per_frame: Option<u64>,
@@ -232,14 +232,20 @@ impl Default for TrainingSettings {
 }
 
 impl TrainingSettings {
-    /// Minimum seconds of training a frame on the CPU.
-    pub fn seconds(&self) -> f64 {
-        self.seconds_per_frame.unwrap_or(1.0)
+    /// Minimum seconds of training a frame on the CPU. `need`: factor on what is not given.
+    pub fn seconds(&self, need: f64) -> f64 {
+        self.seconds_per_frame.unwrap_or(need)
     }
 
-    /// Seconds of training after `picture` seconds of rendering on a device that does both, so that training takes `share` of its time.
-    pub fn turn(&self, picture: f64) -> f64 {
-        (self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
+    /// Seconds of training after `picture` seconds of rendering on a device that does both, so that training takes `share` of its time if `need`, a
+    /// factor on it, is 1.
+    pub fn turn(&self, picture: f64, need: f64) -> f64 {
+        (need * self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
+    }
+
+    /// True if the time of training does not depend on how much is needed.
+    pub fn is_constant(&self, on_device: bool) -> bool {
+        self.steps_per_frame.is_some() || !on_device && self.seconds_per_frame.is_some()
     }
 
     /// Checks ranges.
@@ -296,11 +302,23 @@ mod tests {
     fn a_turn_of_training_is_its_share_of_the_device_s_time() {
         let with = |share, seconds_per_frame| TrainingSettings { share, seconds_per_frame, ..TrainingSettings::default() };
         for share in [0.0, 0.25, 0.5, 0.9] {
-            let turn = with(share, None).turn(0.03);
+            let turn = with(share, None).turn(0.03, 1.0);
             assert!((turn / (turn + 0.03) - share).abs() < 1e-12, "{share}: {turn}");
         }
-        assert_eq!((with(0.5, Some(2.0)).turn(0.03), with(0.5, Some(0.0)).turn(0.03)), (2.0, 0.03), "seconds are the least");
-        assert_eq!((with(0.5, None).seconds(), with(0.5, Some(0.2)).seconds()), (1.0, 0.2));
+        assert_eq!((with(0.5, Some(2.0)).turn(0.03, 1.0), with(0.5, Some(0.0)).turn(0.03, 1.0)), (2.0, 0.03), "seconds are the least");
+        assert_eq!((with(0.5, None).seconds(1.0), with(0.5, Some(0.2)).seconds(1.0)), (1.0, 0.2));
+    }
+
+    #[test]
+    fn need_is_a_factor_on_what_is_not_given() {
+        let with = |seconds_per_frame| TrainingSettings { seconds_per_frame, ..TrainingSettings::default() };
+        assert_eq!((with(None).seconds(0.25), with(Some(0.2)).seconds(0.25)), (0.25, 0.2));
+        assert_eq!((with(None).turn(0.04, 0.25), with(Some(0.2)).turn(0.04, 0.25)), (0.01, 0.2));
+        let steps = TrainingSettings { steps_per_frame: Some(9), ..TrainingSettings::default() };
+        assert_eq!(
+            [with(None), with(Some(0.2)), steps].map(|t| [true, false].map(|on_device| t.is_constant(on_device))),
+            [[false, false], [false, true], [true, true]]
+        );
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Threads and time of training: the split of the CPU threads, and the share of a device's time.
 
+use super::need::Need;
 use super::{RunError, Settings, TrainingSettings};
 use crate::backend::DeviceError;
 use crate::progress::Work;
@@ -12,8 +13,8 @@ pub(super) struct Threads {
     render: rayon::ThreadPool,
     /// Pool that trains during rendering, and the pool of all threads that trains afterwards. `None`: training does not overlap with rendering.
     train: Option<[rayon::ThreadPool; 2]>,
-    /// True if a device trains, so that all threads render.
-    pub(super) device_trains: bool,
+    /// True if training waits for the picture, so that all threads render: a device trains, or little training is needed.
+    pub(super) take_turns: bool,
 }
 
 impl Threads {
@@ -26,24 +27,24 @@ impl Threads {
             rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
         };
         if !learns || all == 1 || share == 0.0 {
-            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None, device_trains: false });
+            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None, take_turns: false });
         }
         let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
         let pools = [pool(train, "ridgewatch-train")?, pool(all, "ridgewatch-all")?];
-        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools), device_trains: false })
+        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools), take_turns: false })
     }
 
     /// Pool that renders.
     pub(super) fn render(&self) -> &rayon::ThreadPool {
         match &self.train {
-            Some([_, all]) if self.device_trains => all,
+            Some([_, all]) if self.take_turns => all,
             _ => &self.render,
         }
     }
 
     /// Pool that trains during rendering, and pool that trains afterwards. `None` if training does not overlap with rendering.
     pub(super) fn beside(&self) -> Option<[&rayon::ThreadPool; 2]> {
-        self.train.as_ref().filter(|_| !self.device_trains).map(|[beside, all]| [beside, all])
+        self.train.as_ref().filter(|_| !self.take_turns).map(|[beside, all]| [beside, all])
     }
 
     /// Pool of all threads.
@@ -67,14 +68,15 @@ impl TrainingBudget {
     /// Minimum seconds of one turn of training.
     const MIN_TURN: f64 = 0.01;
 
-    /// A budget of `share` of the time, from now on.
+    /// A budget of `share` of the time at full need, from now on.
     pub(super) fn new(share: f64) -> Self {
         Self { share, due: 0.0, counted: 0.0 }
     }
 
-    /// Returns the credited seconds at time `now` (seconds since the beginning); `None` if they are too few for a turn.
-    pub(super) fn due(&mut self, now: f64) -> Option<f64> {
-        self.due = (self.due + self.share * (now - self.counted)).min(Self::MAX_DUE);
+    /// Returns the credited seconds at time `now` (seconds since the beginning), of which the latest come with this factor for the need; `None` if
+    /// they are too few for a turn.
+    pub(super) fn due(&mut self, now: f64, need: f64) -> Option<f64> {
+        self.due = (self.due + need * self.share * (now - self.counted)).min(Self::MAX_DUE);
         self.counted = now;
         (self.due >= Self::MIN_TURN).then_some(self.due)
     }
@@ -95,7 +97,7 @@ pub(super) enum Until<'a> {
 }
 
 /// Trains in slices until the end is reached or a stop is requested. `learn` takes the maximum seconds and steps of a slice. The results are added to
-/// `learned`.
+/// `learned`, and tell how much training is needed next.
 ///
 /// # Errors
 /// The device fails; `learned` contains the slices before the failure.
@@ -105,6 +107,7 @@ pub(super) fn train(
     until: Until<'_>,
     stop: &AtomicBool,
     learned: &mut Learned,
+    need: &mut Need,
 ) -> Result<(), DeviceError> {
     const SLICE: f64 = 0.1;
     /// Steps of a slice if the number of steps is given: the result must then not depend on wall-clock time.
@@ -141,6 +144,7 @@ pub(super) fn train(
                 break;
             }
         };
+        need.observe(&slice);
         let learns = slice.steps > 0;
         sum = sum.and(slice);
         if !learns {
@@ -163,7 +167,7 @@ mod tests {
         let settings = TrainingSettings { steps_per_frame: Some(1000), ..TrainingSettings::default() };
         let (mut slices, mut sum) = (slices.into_iter(), Learned::default());
         let learn = |_, _| Ok(slices.next().unwrap_or_default());
-        train(learn, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum).unwrap();
+        train(learn, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum, &mut Need::default()).unwrap();
         assert_eq!((sum.steps, sum.lost_steps, sum.samples, sum.rollbacks, sum.dropped), (40, 90, 1000, 1, 3));
         // (300 * 1 + 500 * 2 + 200 * 6) / 1000.
         assert_eq!(sum.loss, Some(2.5));
@@ -174,29 +178,31 @@ mod tests {
             calls += 1;
             if calls < 3 { Ok(slice(5, 10, None, 0)) } else { Err(DeviceError::Driver { doing: "training", reason: "by the test".into() }) }
         };
-        train(fails, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum).unwrap_err();
+        train(fails, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum, &mut Need::default()).unwrap_err();
         assert_eq!((sum.steps, sum.samples), (10, 20));
     }
 
-    /// Training gets its share of the time for any length of frames and any delay of a turn.
+    /// Training gets its share of the time, as far as it is needed, for any length of frames and any delay of a turn.
     #[test]
     fn turns_are_a_share_of_the_time() {
-        for (share, frame, longer) in [(0.25, 0.007, 1.0), (0.25, 0.2, 1.0), (0.75, 0.03, 1.5), (0.5, 0.4, 0.3)] {
+        for (share, need, frame, longer) in
+            [(0.25, 1.0, 0.007, 1.0), (0.25, 1.0, 0.2, 1.0), (0.75, 1.0, 0.03, 1.5), (0.5, 1.0, 0.4, 0.3), (0.5, 0.125, 0.03, 1.5)]
+        {
             let (mut turns, mut now, mut trained) = (TrainingBudget::new(share), 0.0, 0.0);
             for _ in 0..20_000 {
                 now += frame;
-                while let Some(due) = turns.due(now) {
+                while let Some(due) = turns.due(now, need) {
                     let took = longer * f64::min(due, 0.05);
                     turns.took(took);
                     now += took;
                     trained += took;
                 }
             }
-            assert!((trained / now - share).abs() < 0.01, "{share} of frames of {frame} s: {}", trained / now);
+            assert!((trained / now - need * share).abs() < 0.01, "{need} of {share} of frames of {frame} s: {}", trained / now);
         }
         let mut none = TrainingBudget::new(0.0);
-        assert_eq!(none.due(1e6), None);
+        assert_eq!(none.due(1e6, 1.0), None);
         let mut late = TrainingBudget::new(0.5);
-        assert_eq!(late.due(1e6), Some(TrainingBudget::MAX_DUE), "what was missed is not made up for");
+        assert_eq!(late.due(1e6, 1.0), Some(TrainingBudget::MAX_DUE), "what was missed is not made up for");
     }
 }

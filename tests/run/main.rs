@@ -11,6 +11,7 @@ mod kit;
 mod maps;
 mod messages;
 mod movie;
+mod need;
 #[path = "../network_support/mod.rs"]
 mod network_support;
 mod notes;
