@@ -228,6 +228,15 @@ mod tests {
         }
     }
 
+    /// The trainer lowers its rate each 512 steps, seven times, if the loss has stopped falling.
+    #[test]
+    fn a_loss_that_falls_with_the_learning_rate_needs_all_training() {
+        for seed in 0..8 {
+            let needs = Training::new(seed).take(8 * 512 / 16, |steps| 0.9f64.powf((steps / 512.0).floor()));
+            assert!(needs.iter().all(|&need| need == 1.0), "seed {seed}");
+        }
+    }
+
     #[test]
     fn a_loss_of_zero_has_stalled() {
         assert!(Training::new(0).take(1000, |_| 0.0).ends_with(&[LEAST]));
