@@ -1,8 +1,8 @@
 //! How much of its time training needs: all of it while the loss falls, a sixteenth once the loss has stalled.
 //!
-//! The loss is compared over the two last quarters of the steps since the labels or the network changed. The comparison thus has no length of its
-//! own: a loss that falls as a power of the steps falls as much from one quarter to the next at any time, however slow it has become. A lower learning
-//! rate, which the trainer chooses when the loss stands, lets it fall again; that counts as falling.
+//! The loss is compared over the two last quarters of the steps since the labels or the network changed. The comparison thus has no length
+//! of its own: a loss that falls as a power of the steps falls as much from one quarter to the next at any time, however slow it has become. A
+//! lower learning rate, which the trainer chooses when the loss stands, lets it fall again; that counts as falling.
 
 use crate::surrogate::Learned;
 use std::collections::VecDeque;
@@ -15,8 +15,8 @@ const FIRST_STEPS: u64 = 2048;
 const LEAST_BLOCKS: usize = 8;
 /// Steps since the change, as a multiple of those of a new block at most.
 const PARTS: u64 = 64;
-/// Relative change of the loss from one quarter to the next up to which it stands. A mean square that falls as much loses half a decibel each time the
-/// steps double.
+/// Relative change of the loss from one quarter to the next up to which it stands. A mean square that falls as much loses half a decibel
+/// each time the steps double.
 const SMALL_CHANGE: f64 = 0.05;
 /// Standard errors that a fall must exceed to end a stall, so that noise does not.
 const SURE: f64 = 3.0;
@@ -111,8 +111,8 @@ impl Need {
         }
     }
 
-    /// Seconds of the next turn of training, of which `due` come with the present frame. A turn takes a step at least; while the loss has stalled, the
-    /// next turns are shorter or left out until that is made up for.
+    /// Seconds of the next turn of training, of which `due` come with the present frame. A turn takes a step at least; while the loss has
+    /// stalled, the next turns are shorter or left out until that is made up for.
     pub(super) fn turn(&mut self, due: f64) -> f64 {
         self.owed = if self.stall.is_some() { self.owed + due } else { due };
         // Time missed while there was nothing to learn is not made up.

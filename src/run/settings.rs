@@ -237,8 +237,8 @@ impl TrainingSettings {
         self.seconds_per_frame.unwrap_or(need)
     }
 
-    /// Seconds of training after `picture` seconds of rendering on a device that does both, so that training takes `share` of its time if `need`, a
-    /// factor on it, is 1.
+    /// Seconds of training after `picture` seconds of rendering on a device that does both, so that training takes `share` of its time if
+    /// `need`, a factor on it, is 1.
     pub fn turn(&self, picture: f64, need: f64) -> f64 {
         (need * self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
     }

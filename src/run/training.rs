@@ -73,8 +73,8 @@ impl TrainingBudget {
         Self { share, due: 0.0, counted: 0.0 }
     }
 
-    /// Returns the credited seconds at time `now` (seconds since the beginning), of which the latest come with this factor for the need; `None` if
-    /// they are too few for a turn.
+    /// Returns the credited seconds at time `now` (seconds since the beginning), of which the latest come with this factor for the need;
+    /// `None` if they are too few for a turn.
     pub(super) fn due(&mut self, now: f64, need: f64) -> Option<f64> {
         self.due = (self.due + need * self.share * (now - self.counted)).min(Self::MAX_DUE);
         self.counted = now;

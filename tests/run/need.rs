@@ -3,8 +3,8 @@
 use crate::kit::scene::{self, SMALL_NETWORK};
 use ridgewatch::run::{FrameRecord, RunOptions};
 
-/// Records of a still double gyre on the CPU, whose network learns at a rate at which it learns nothing: the loss stands from the first step, on any
-/// machine.
+/// Records of a still double gyre on the CPU, whose network learns at a rate at which it learns nothing: the loss stands from the first
+/// step, on any machine.
 fn records(keys: &[&str]) -> Vec<FrameRecord> {
     let common = "
         time.tau = 5
