@@ -4,7 +4,7 @@ use super::common::{Common, Interrupted, Usage, device, located, print_json, pri
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
-use ridgewatch::chart::{Curve, Epoch, TrainOptions, train, write_epochs};
+use ridgewatch::chart::{Curve, Epoch, TrainOptions, TrainReport, train, write_epochs};
 use ridgewatch::files::{open, write_whole};
 use ridgewatch::publish::write_png;
 use ridgewatch::render::Film;
@@ -91,22 +91,30 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     write_whole(&path, write_epochs(&scene.title, &curves)?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
     if common.json {
         print_json(&report)?;
-    } else if let Some(last) = report.epochs.last() {
-        let psnr = last.psnr.map_or(String::new(), |psnr| format!(", {psnr:.1} dB"));
-        print_text(format_args!(
-            "{}: epochs.csv, epochs.svg, epoch_*.png; after {} epochs ({} steps, {:.1} s, {:.1} MB) the log-stretch has an error of {:.4}{psnr}",
-            options.out.display(),
-            last.epoch,
-            last.steps,
-            last.seconds,
-            report.bytes as f64 / 1e6,
-            last.rms
-        ));
+    } else if let Some(text) = summary(&options.out, &report) {
+        print_text(text);
     }
     match stop.status() {
         0 => Ok(()),
         status => bail!(Interrupted { status, done: "the epochs until then are written" }),
     }
+}
+
+/// The result for people: where it is, how good it is, and what was chosen for open settings. `None` if no epoch was trained.
+fn summary(out: &Path, report: &TrainReport) -> Option<String> {
+    let last = report.epochs.last()?;
+    let psnr = last.psnr.map_or(String::new(), |psnr| format!(", {psnr:.1} dB"));
+    let mut text = format!(
+        "{}: epochs.csv, epochs.svg, epoch_*.png; after {} epochs ({} steps, {:.1} s, {:.1} MB) the log-stretch has an error of {:.4}{psnr}",
+        out.display(),
+        last.epoch,
+        last.steps,
+        last.seconds,
+        report.bytes as f64 / 1e6,
+        last.rms
+    );
+    report.decisions.iter().for_each(|decision| text += &format!("\n{decision}"));
+    Some(text)
 }
 
 fn name_of(folder: &Path) -> String {
@@ -141,4 +149,32 @@ fn write_csv(path: &Path, epochs: &[Epoch]) -> Result<()> {
         let _ = writeln!(text, "{epoch},{steps},{seconds:.3},{},{rms:.6e},{},{rollbacks}", number(*loss), number(*psnr));
     }
     write_whole(path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ridgewatch::run::Decision;
+
+    #[test]
+    fn the_summary_ends_with_what_was_chosen() {
+        let epoch = Epoch { epoch: 2, steps: 8, seconds: 0.5, loss: None, rms: 0.125, psnr: None, rollbacks: 0 };
+        let decisions = vec![Decision::new("network.batch", 16_384, "few labels"), Decision::new("network.levels", 4, "few levels")];
+        let report = |epochs| TrainReport {
+            epochs,
+            label_seconds: 0.1,
+            bytes: 2_000_000,
+            device: "cpu".into(),
+            decisions: decisions.clone(),
+            interrupted: false,
+        };
+        let text = summary(Path::new("out"), &report(vec![epoch])).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        assert!(
+            lines[0].starts_with("out: ")
+                && lines[0].ends_with("after 2 epochs (8 steps, 0.5 s, 2.0 MB) the log-stretch has an error of 0.1250")
+        );
+        assert_eq!(lines[1..], ["network.batch = 16384: few labels", "network.levels = 4: few levels"]);
+        assert_eq!(summary(Path::new("out"), &report(Vec::new())), None);
+    }
 }
