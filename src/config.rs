@@ -233,12 +233,13 @@ impl SceneFile {
         let gridded = matches!(kind, Archive | Live | Turbulence);
         let adaptive = flow.integrator == Integrator::DormandPrince;
         let (learns, hashed) = (self.surrogate.kind != Kind::Table, network.encoding == Encoding::HashGrid);
-        let rules: [(bool, &'static str, &'static [&'static str]); 20] = [
+        let rules: [(bool, &'static str, &'static [&'static str]); 21] = [
             (*kind == Archive, "only with source.kind = \"archive\"", &["archive"]),
             (self.archive.files.is_empty(), "only without archive.files", &["archive.synthetic"]),
             (*kind == Live, "only with source.kind = \"live\"", &["live"]),
             (!gridded, "only with closed forms; snapshots have their own times", &["time.start"]),
             (!gridded, "only with closed forms; time.snapshots_per_slide is the step of snapshots", &["time.seed_step"]),
+            (gridded, "only with snapshots; a closed form has a velocity at all times", &["time.every"]),
             (gridded, "only with snapshots; time.seed_step is the step of closed forms", &["time.snapshots_per_slide"]),
             (flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\"", &["flow.difference_step"]),
             (!adaptive, "only without flow.integrator = \"dormand_prince\", which chooses its steps", &["flow.steps"]),

@@ -76,7 +76,7 @@ fn winds(edition: u8) -> Vec<u8> {
 /// Whether all snapshots of a file can be read; `None` if it cannot be opened.
 fn answered(path: &Path, settings: &ArchiveSettings) -> Option<bool> {
     let files = [path.to_owned()];
-    if let Ok(inspection) = inspect(&files, settings, None) {
+    if let Ok(inspection) = inspect(&files, settings, 1, None) {
         assert!(inspection.to_string().contains("mutant.grib"));
     }
     match Archive::open(&files, settings) {

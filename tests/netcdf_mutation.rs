@@ -99,7 +99,7 @@ fn mutated_files_are_answered() {
                     assert!(error.to_string().contains("mutant.nc"), "names no file: {name}: {error}");
                 }
             }
-            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &settings, None) {
+            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &settings, 1, None) {
                 assert!(inspection.to_string().contains("mutant.nc"));
             }
             // A millisecond's work; the machine may be slow and busy.

@@ -94,7 +94,7 @@ fn mutated_stores_are_answered() {
 fn answered(path: &Path, settings: &ArchiveSettings) -> Option<bool> {
     let files = [path.to_owned()];
     let name = path.file_name().unwrap().to_str().unwrap();
-    if let Ok(inspection) = inspect(&files, settings, None) {
+    if let Ok(inspection) = inspect(&files, settings, 1, None) {
         assert!(inspection.to_string().contains(name));
     }
     match Archive::open(&files, settings) {

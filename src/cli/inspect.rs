@@ -39,7 +39,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
     };
     let spinner = messages::spinner("opening the files".into());
-    let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)
+    let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, scene.time.every, tau)
         .map_err(|error| located(&scene, error, SourceError::refused))?;
     spinner.finish_and_clear();
     if common.json {

@@ -185,6 +185,7 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
         ("archive", "w = \"none\"", "archive.w"),
         ("archive.synthetic", "shape = \"flame\"", "archive.synthetic.shape"),
         ("live", "at_end = \"stop\"", "live.at_end"),
+        ("time", "every = 2", "time.every"),
         ("time", "snapshots_per_slide = 2", "time.snapshots_per_slide"),
         ("flow", "difference_step = 1e-3", "flow.difference_step"),
         ("flow", "tolerance = 0.1\nsteps = 9", "flow.tolerance"),

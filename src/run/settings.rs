@@ -146,6 +146,9 @@ pub struct TimeSettings {
     pub seed_step: f64,
     /// Maximum number of slides; `None`: 1 for closed forms, all for snapshots.
     pub slides: Option<usize>,
+    /// Every how many snapshots one is read, from the first one on; beside a simulation, every how many complete steps one is taken. Whatever counts
+    /// snapshots counts those that are read.
+    pub every: usize,
     /// Number of snapshots by which the window moves from slide to slide.
     pub snapshots_per_slide: usize,
     /// Frames rendered at each slide.
@@ -164,6 +167,7 @@ impl Default for TimeSettings {
             start: 0.0,
             seed_step: 1.0,
             slides: None,
+            every: 1,
             snapshots_per_slide: 1,
             frames_per_slide: 1,
             warmup_frames: 0,
@@ -200,6 +204,7 @@ impl TimeSettings {
         if let Some(slides) = time.slides {
             count("time.slides", slides, 1, 10_000_000)?;
         }
+        count("time.every", time.every, 1, 1_000_000)?;
         count("time.snapshots_per_slide", time.snapshots_per_slide, 1, 1_000_000)?;
         count("time.frames_per_slide", time.frames_per_slide, 1, 1_000_000)?;
         count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)?;

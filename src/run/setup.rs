@@ -12,7 +12,7 @@ use crate::render::{Combine, Method, RenderSettings, Renderer, Scene, TransferSe
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
 use crate::source::{
-    DEFAULT_READ_AHEAD, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, duration, window_snapshots,
+    DEFAULT_READ_AHEAD, Every, Georeference, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, duration, window_snapshots,
 };
 use crate::surrogate::network::{Input, NetworkSettings};
 use crate::surrogate::{Kind, SurrogateSettings};
@@ -88,12 +88,14 @@ impl Setup {
         Self::settle(scene, snapshots, None)
     }
 
-    /// Sets up a run over the caller's snapshots instead of those that the scene describes; `None` for closed forms.
+    /// Sets up a run over the caller's snapshots (every `time.every`-th of them) instead of those that the scene describes; `None` for closed
+    /// forms.
     ///
     /// # Errors
     /// A setting is not accepted, or the snapshots do not span tau.
     pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, RunError> {
         scene.check()?;
+        let snapshots = snapshots.map(|source| Box::new(Every::new(source, scene.time.every)) as Box<dyn SnapshotSource>);
         Self::settle(scene, snapshots, None)
     }
 
@@ -232,7 +234,7 @@ impl Setup {
         }
         let slides = match live {
             Some(live) => {
-                let window = live.follow_beside(tau, scene.time.snapshots_per_slide, u64::from(holds_both))?;
+                let window = live.follow_beside(tau, scene.time.snapshots_per_slide, scene.time.every, u64::from(holds_both))?;
                 live_slides(&scene, window, direction)
             }
             None => open_slides(&scene, snapshots, tau, direction)?,

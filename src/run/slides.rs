@@ -9,8 +9,8 @@ use crate::progress::{self, Work};
 use crate::setting::{Refused, shown};
 use crate::source::live::{Follow, LiveRecord, LiveWindow, NextWindow};
 use crate::source::{
-    Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, follow,
-    read_ahead,
+    Archive, DEFAULT_READ_AHEAD, Every, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading,
+    follow, read_ahead,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -430,14 +430,17 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
     })
 }
 
-/// Opens a gridded source.
+/// Opens a gridded source, of which every `time.every`-th snapshot is read.
 ///
 /// # Errors
 /// The source is live or a closed form, or the archive cannot be opened.
 pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, RunError> {
     let source = &scene.source;
     match source.kind {
-        SourceKind::Archive => return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?)),
+        SourceKind::Archive => {
+            let archive = Archive::open(&scene.archive.files, &scene.archive)?;
+            return Ok(Box::new(Every::new(Box::new(archive), scene.time.every)));
+        }
         SourceKind::Live => {
             let accepted = "with `ridgewatch attach`: this command needs a source that it can read again";
             return Err(Refused::new("source.kind", "is \"live\"", accepted).into());
@@ -456,7 +459,8 @@ pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, RunEr
     let times = (0..source.snapshots.unwrap_or(12)).map(|t| t as f64).collect();
     let [x, y, z] = nodes;
     let source = MemorySource::new(format!("{x} x {y} x {z} nodes"), grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?;
-    Ok(Box::new(source.synthetic(Turbulence::described(modes, k_max, amplitude, TURBULENCE_SEED))))
+    let source = source.synthetic(Turbulence::described(modes, k_max, amplitude, TURBULENCE_SEED));
+    Ok(Box::new(Every::new(Box::new(source), scene.time.every)))
 }
 
 /// Error of a closed form without `[domain]`.

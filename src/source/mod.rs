@@ -28,7 +28,7 @@ mod snapshots;
 mod source_settings;
 
 pub use archive::{
-    Archive, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead, ResamplingReport,
+    Archive, AxisReport, DEFAULT_READ_AHEAD, Every, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead, ResamplingReport,
     ResolutionReport, Steady, TimeReport, VariableReport, expand, follow, inspect, read_ahead, synthesize,
 };
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};

@@ -87,7 +87,7 @@ fn same(found: &mut Archive, expected: &mut Archive, what: &str) {
 /// Inspects files with the default settings.
 fn inspected(files: &[impl AsRef<Path>]) -> Inspection {
     let files: Vec<PathBuf> = files.iter().map(|file| file.as_ref().to_owned()).collect();
-    inspect(&files, &ArchiveSettings::default(), None).unwrap()
+    inspect(&files, &ArchiveSettings::default(), 1, None).unwrap()
 }
 
 fn notes(archive: &Archive) -> String {

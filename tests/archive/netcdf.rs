@@ -373,7 +373,7 @@ fn inspection_says_what_and_why() {
         [("time", HOURS, &[0.0, 1.0, 2.0, 3.0]), ("y", "m", &[4.0, 2.0, 0.0]), ("x", "m", &[0.0, 1.0, 2.0, 3.0])];
     let fixture = Fixture::on(CLASSIC, &axes).winds(Data::F64(values), Data::F64(vec![0.0; 48]));
     let file = fixture.fields("K", [("sst", Data::F64(vec![0.0; 48]))]).write(&dir.path().join("inspected.nc"));
-    let inspection = inspect(&[file], &settings(""), Some(7200.0)).unwrap();
+    let inspection = inspect(&[file], &settings(""), 1, Some(7200.0)).unwrap();
     let resolution = inspection.resolution.as_ref().unwrap();
     // u crosses half a cell an hour; stored as f32.
     assert!((resolution.rms_cells - 0.5).abs() < 1e-6 && (resolution.max_cells - 0.5).abs() < 1e-6);

@@ -151,6 +151,20 @@ fn memory_is_kept_to_by_leaving_steps_out() {
 }
 
 #[test]
+fn every_third_complete_step_is_taken_whatever_its_number() {
+    let folder = Folder::new("every");
+    let solver = producer(&folder, plane(8));
+    let live = Live::connect(&settings(&folder), &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
+    let window = live.follow_beside(6.0, 1, 3, 0).unwrap();
+    // Every third number would be all of them.
+    (0..11).for_each(|n| publish(&solver, 3 * n, n as f64, 1.0));
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 9.0);
+    assert_eq!(taken.window.snapshots().map(|s| s.time).collect::<Vec<_>>(), [3.0, 6.0, 9.0]);
+    assert_eq!((taken.live.step, taken.live.steps_skipped, taken.live.snapshots), (27, 0, 3));
+    assert!(warnings.is_empty(), "{warnings:?}");
+}
+
+#[test]
 fn too_little_memory_is_refused_in_words() {
     let folder = Folder::new("small");
     let _solver = producer(&folder, plane(256));
@@ -159,7 +173,7 @@ fn too_little_memory_is_refused_in_words() {
     let error = connect().follow(1.0, 1).err().unwrap();
     assert!(error.to_string().contains("live.memory_gib") && error.to_string().contains("three snapshots, twice"), "{error}");
     // A third window for maps of both directions.
-    let beside = connect().follow_beside(1.0, 1, 1).err().unwrap().to_string();
+    let beside = connect().follow_beside(1.0, 1, 1, 1).err().unwrap().to_string();
     let least = |text: &str| text.split("at least ").nth(1).unwrap().split(':').next().unwrap().parse::<f64>().unwrap();
     assert!(beside.contains("three snapshots, 3 times") && least(&beside) > least(&error.to_string()), "{beside}");
 }

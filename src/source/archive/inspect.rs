@@ -2,6 +2,7 @@
 
 use super::archive::{Archive, Displacement, files_of};
 use super::check::check;
+use super::every::Every;
 use super::group::open_group;
 use super::limits;
 use crate::archive_settings::ArchiveSettings;
@@ -9,7 +10,7 @@ use crate::cf::velocity;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Listing};
 use crate::grids::{AxisPlan, InFile, Quantity, ResamplingError, readable_axes};
-use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, median_interval, span, window_snapshots};
+use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, median_interval, span, time_gaps, window_snapshots};
 use ridgewatch_base::setting::{Refused, word};
 use serde::Serialize;
 use std::fmt;
@@ -157,11 +158,12 @@ pub struct ResolutionReport {
     pub warning: Option<String>,
 }
 
-/// Inspects an archive. If the first file's header can be read, other errors become [`Inspection::problem`].
+/// Inspects an archive of which every `every`-th snapshot is read (1: all). If the first file's header can be read, other errors become
+/// [`Inspection::problem`].
 ///
 /// # Errors
 /// No file; a first file that is missing, damaged or of another format.
-pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
+pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, every: usize, tau: Option<f64>) -> Result<Inspection, SourceError> {
     let files = files_of(paths, settings)?;
     let Some(file) = files.first().cloned() else { return Err(SourceError::NoFiles) };
     check(settings)?;
@@ -186,7 +188,7 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
             if let Some(group) = archive.first_group().filter(|group| **group != [inspection.file.clone()]) {
                 inspection.variables = variables(&open_group(group, limits(settings))?.listing, settings);
             }
-            inspection.fill(archive, settings.steady, tau)?;
+            inspection.fill(archive, settings.steady, every.max(1), tau)?;
         }
         Err(error) => {
             (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused());
@@ -233,7 +235,7 @@ fn variables(listing: &Listing, settings: &ArchiveSettings) -> Vec<VariableRepor
 }
 
 impl Inspection {
-    fn fill(&mut self, mut archive: Archive, steady: bool, tau: Option<f64>) -> Result<(), SourceError> {
+    fn fill(&mut self, mut archive: Archive, steady: bool, every: usize, tau: Option<f64>) -> Result<(), SourceError> {
         let description = archive.describe();
         let mut give = |name: &str, role: &str, why: String| {
             if let Some(variable) = self.variables.iter_mut().find(|v| v.name == name) {
@@ -257,28 +259,31 @@ impl Inspection {
             let ResamplingError { at_points, between, velocity } = error;
             Some(ResamplingReport { what, error: at_points, error_between: between, velocity, warning })
         });
-        self.time = Some(times(&archive, &description, steady, tau));
-        let count = archive.times().len();
+        let count = archive.times().len().div_ceil(every);
         let sampled = count.min(SAMPLED);
         let mut sum = Displacement::default();
         for k in 0..sampled {
             // Evenly over the archive, ends included.
-            sum.add(&archive.displacement(if sampled > 1 { k * (count - 1) / (sampled - 1) } else { 0 })?);
+            sum.add(&archive.displacement(if sampled > 1 { k * (count - 1) / (sampled - 1) * every } else { 0 })?);
         }
         self.missing = Some(MissingReport { sampled, share: sum.missing as f64 / (sum.missing + sum.known).max(1) as f64 });
         if sum.known > 0 && count > 1 {
             let mean = |s: f64| (s / sum.known as f64).sqrt();
-            let rms_cells = mean(sum.squared_cells);
+            // In an interval of those that are read.
+            let rms_cells = every as f64 * mean(sum.squared_cells);
             self.resolution = Some(ResolutionReport {
                 rms_cells,
-                max_cells: sum.max_cells,
+                max_cells: every as f64 * sum.max_cells,
                 rms_velocity: sum.squared_velocity.iter().take(archive.grid().dimensions()).map(|&s| mean(s)).collect(),
                 warning: (rms_cells > 4.0).then(|| {
                     format!("particles cross {rms_cells:.1} cells between snapshots (root mean square): too coarse in time for linear interpolation")
                 }),
             });
         }
-        self.source = Some(description);
+        let gaps = time_gaps(&archive.seconds.iter().copied().step_by(every).collect::<Vec<_>>());
+        let source = Every::new(Box::new(archive), every);
+        self.time = Some(times(&source, gaps, steady, tau));
+        self.source = Some(source.describe());
         Ok(())
     }
 }
@@ -306,17 +311,17 @@ impl Inspection {
     }
 }
 
-fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
-    let times = archive.times();
-    let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
+fn times(source: &dyn SnapshotSource, gaps: Vec<TimeGap>, steady: bool, tau: Option<f64>) -> TimeReport {
+    let (times, unit) = (source.times(), source.describe().time_unit);
+    let show = |t: f64| source.date(t).unwrap_or_else(|| format!("{t} {unit}"));
     let interval = median_interval(times);
     let steady = steady && times.len() == 1;
     let tau_is_given = tau.is_some();
     let tau = match tau {
         Some(tau) if steady => Ok(tau),
-        Some(tau) => archive.check_tau(tau).map(|()| tau),
+        Some(tau) => source.check_tau(tau).map(|()| tau),
         None if steady => Err(SourceError::setting("tau", "missing", "a duration, since a steady flow has no default")),
-        None => archive.longest_default_tau(),
+        None => source.longest_default_tau(),
     };
     // A steady flow counts twice (see [`super::steady::Steady`]).
     let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { window_snapshots(times, t) });
@@ -325,10 +330,10 @@ fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: 
         first: show(times[0]),
         last: show(times[0] + span(times)),
         interval,
-        unit: description.time_unit.clone(),
-        gaps: archive.gaps(),
+        unit,
+        gaps,
         window_snapshots: snapshots,
-        window_bytes: snapshots.map(|s| s * archive.grid().nodes() * size_of::<[f32; 4]>()),
+        window_bytes: snapshots.map(|s| s * source.grid().nodes() * size_of::<[f32; 4]>()),
         tau_problem: tau.as_ref().err().map(ToString::to_string),
         tau: tau.ok(),
         tau_is_given,

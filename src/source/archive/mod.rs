@@ -6,6 +6,7 @@
 #[allow(clippy::module_inception)] // The archive itself.
 mod archive;
 mod check;
+mod every;
 mod files;
 mod follow;
 mod group;
@@ -16,6 +17,7 @@ mod steady;
 mod synthetic;
 
 pub use archive::Archive;
+pub use every::Every;
 pub use files::expand;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use memory::MemorySource;

@@ -193,14 +193,15 @@ impl Live {
     /// # Errors
     /// Too little memory for three snapshots; the thread cannot be started.
     pub fn follow(self, tau: f64, stride: usize) -> Result<LiveWindow, SourceError> {
-        self.follow_beside(tau, stride, 0)
+        self.follow_beside(tau, stride, 1, 0)
     }
 
-    /// The same, and leaves memory for so many windows that others hold besides that of the current frame.
+    /// The same with every `every`-th complete step alone, which a slide then counts, and with memory for so many windows that others hold besides
+    /// that of the current frame.
     ///
     /// # Errors
     /// As for [`Live::follow`].
-    pub fn follow_beside(self, tau: f64, stride: usize, others: u64) -> Result<LiveWindow, SourceError> {
+    pub fn follow_beside(self, tau: f64, stride: usize, every: usize, others: u64) -> Result<LiveWindow, SourceError> {
         let live = self;
         let nodes = live.grid.nodes() as u64;
         let (snapshot, step) = (16 * nodes, 4 * nodes * live.description.components() as u64);
@@ -218,7 +219,7 @@ impl Live {
         let room = room as usize;
         let shared = Arc::new(Shared::new(tau));
         let conversion = Conversion::new(live.grid.clone())?;
-        let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), stride);
+        let mut reader = Reader { every: every as u64, ..Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), stride) };
         let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
         let thread = thread.map_err(|e| SourceError::Inconsistent(format!("the live thread could not start: {e}")))?;
         Ok(LiveWindow { shared, stride, thread: Some(thread) })
@@ -328,6 +329,8 @@ struct Reader {
     conversion: Conversion,
     thinning: Thinning,
     stride: usize,
+    /// Every how many complete steps one is taken.
+    every: u64,
     late: u32,
     /// [`LARGE`].
     large: usize,
@@ -337,7 +340,7 @@ impl Reader {
     fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
         let limit = Duration::from_secs_f64(live.settings.block_timeout_seconds);
         let assembler = Assembler::new(&live.description, limit, MAX_PENDING);
-        Self { live, shared, assembler, conversion, thinning, stride, late: 0, large: LARGE }
+        Self { live, shared, assembler, conversion, thinning, stride, every: 1, late: 0, large: LARGE }
     }
 
     fn run(&mut self) {
@@ -416,7 +419,14 @@ impl Reader {
                 self.thinning.restart();
             }
         }
+        // Not by its number: a simulation may publish every tenth step.
+        let is_taken = state.live.steps.is_multiple_of(self.every.max(1));
         state.live.steps += 1;
+        if !is_taken {
+            drop(state);
+            self.assembler.recycle(values);
+            return;
+        }
         let keep = self.thinning.keeps(time, &state.window);
         // Conversion and measurement take long: release the lock so that frames are made meanwhile, and renew the heartbeat.
         drop(state);

@@ -106,7 +106,7 @@ fuzz_target!(|input: &[u8]| {
             let _ = archive.date(archive.times()[index]);
         }
     }
-    if let Ok(inspection) = inspect(std::slice::from_ref(path), &settings, None) {
+    if let Ok(inspection) = inspect(std::slice::from_ref(path), &settings, 1, None) {
         assert!(!inspection.to_string().is_empty());
     }
 });
