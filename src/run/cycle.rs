@@ -597,6 +597,7 @@ impl<B: Backend> Cycle<'_, B> {
             self.take_steps(chosen, Some(settled));
             transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         }
+        self.tell_snapshots(slide, chosen)?;
         self.settle_storage(slide, true)?;
         Ok(())
     }
@@ -712,8 +713,9 @@ impl<B: Backend> Cycle<'_, B> {
             }
             if let Some(change) = resolution.ftle_change.filter(|change| *change < FINE_IN_TIME * resolution.ftle_rms) {
                 sink(Event::Note(format!(
-                    "fine in time: without every second snapshot the FTLE changes by {:.2} % of its root mean square; half of the snapshots would do",
-                    100.0 * change / resolution.ftle_rms
+                    "fine in time: without every second snapshot the FTLE changes by {:.2} % of its root mean square; half of the snapshots would do (time.every = {})",
+                    100.0 * change / resolution.ftle_rms,
+                    2 * self.run.plan.scene.time.every
                 )));
             }
             self.run.report.time_resolution = Some(resolution);

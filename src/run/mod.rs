@@ -25,6 +25,7 @@ mod scene;
 mod settings;
 mod setup;
 mod slides;
+mod snapshots;
 mod steering;
 mod steps;
 mod stop;

@@ -145,7 +145,8 @@ impl Comparison {
         Ok(Some(Self { points, truth, of_steps: 0.0 }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
     }
 
-    fn of(&self, shown: Shown<'_>, slide: &Slide, steps: usize) -> Result<PictureSteps, RunEnd> {
+    /// How far `steps` steps through this slide are from the truth.
+    pub(super) fn of(&self, shown: Shown<'_>, slide: &Slide, steps: usize) -> Result<PictureSteps, RunEnd> {
         check_stop(shown.stop)?;
         progress::mark();
         let mut traced = Traced::default();

@@ -4,7 +4,7 @@ use crate::kit::netcdf::{Fixture, NETCDF4, f32s, fill};
 use crate::kit::program::{self, config, records, run, set, summary, text};
 use crate::kit::scene;
 use crate::{picture, ridgewatch};
-use ridgewatch::run::FrameRecord;
+use ridgewatch::run::{FrameRecord, open_snapshots};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -68,6 +68,45 @@ fn an_archive_that_is_followed_gives_the_slides_that_come() {
     let dates: Vec<String> = records(&out).into_iter().map(|r| r.date.unwrap()).collect();
     assert_eq!(dates, (3..8).map(|day| format!("2000-01-{day:02}T00:00:00Z")).collect::<Vec<_>>());
     assert_eq!(summary(&out)["run"]["slides"], 5);
+}
+
+#[test]
+fn one_of_three_snapshots_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = eddy(folder.path());
+    let report = |keys: &[&str]| ridgewatch([&["inspect", text(&file), "--json"][..], &set(keys)].concat()).success().json();
+    let (all, read) = (report(&[]), report(&["time.every=3"]));
+    let of = |report: &serde_json::Value, key: &str| report["time"][key].clone();
+    assert_eq!((of(&all, "snapshots"), of(&read, "snapshots"), of(&read, "interval")), (10.into(), 4.into(), (3.0 * 86_400.0).into()));
+    assert_eq!(of(&read, "last"), "2000-01-10T00:00:00Z");
+    assert!(read["source"]["notes"].to_string().contains("4 of 10 snapshots are read, as set (time.every = 3)"), "{read}");
+    // A particle goes three times as far between two of them. Both look at the first and the last, and at others between.
+    let far = |report: &serde_json::Value| report["resolution"]["rms_cells"].as_f64().unwrap();
+    assert!((2.5..=3.5).contains(&(far(&read) / far(&all))), "{} {}", far(&read), far(&all));
+    for (snapshots, read) in [(8, 3), (9, 3), (10, 4)] {
+        let name = format!("of_{snapshots}.nc");
+        let file = days_of_eddy(folder.path(), &name, 0..snapshots);
+        let scene = scene::scene("archive", [8, 8, 1], &format!("archive.files = [{:?}]\ntime.every = 3", text(&file)));
+        let mut source = open_snapshots(&scene::parse(&scene, &[]).unwrap().settings()).unwrap();
+        assert_eq!(source.times().len(), read, "ceil({snapshots} / 3)");
+        let days: Vec<f64> = (0..read).map(|index| (source.read(index).unwrap().time - source.times()[0]) / 86_400.0).collect();
+        assert_eq!(days, (0..read).map(|index| 3.0 * index as f64).collect::<Vec<_>>());
+    }
+    // Days 0, 3, 6 and 9: two windows of six days, and one that moves by two snapshots.
+    let dates = |name: &str, keys: &[&str]| {
+        let run = folder.path().join(name);
+        replay(text(&file), &run, &set(&[&["time.every=3", "render.method=reference", "time.tau=6 days"][..], keys].concat()));
+        records(&run).into_iter().map(|record| record.date.unwrap()).collect::<Vec<_>>()
+    };
+    assert_eq!(dates("single", &[]), ["2000-01-07T00:00:00Z", "2000-01-10T00:00:00Z"]);
+    assert_eq!(dates("double", &["time.tau=3 days", "time.snapshots_per_slide=2"]), ["2000-01-04T00:00:00Z", "2000-01-10T00:00:00Z"]);
+    let out = folder.path().join("none");
+    let refused = |keys: &[&str], status, parts: &[&str]| {
+        ridgewatch([&["replay", text(&file), "--out", text(&out)][..], &set(keys)].concat()).refused(status, parts);
+    };
+    refused(&["time.every=10"], 1, &["eddy.nc (time.every = 10) holds one time"]);
+    refused(&["time.every=3", "time.tau=9.5 days"], 1, &["eddy.nc (time.every = 3) has 4"]);
+    refused(&["time.every=0"], 2, &["`time.every` is 0; accepted: a whole number from 1 to 1000000"]);
 }
 
 /// HDF5 locks files that it reads, and a solver that cannot open its file to append to it ends.
@@ -323,7 +362,7 @@ fn what_is_chosen_is_in_the_summary_with_its_reason_and_can_be_given() {
     };
     let open = decisions("open", &[]);
     let settings: Vec<&str> = open.iter().map(|[setting, ..]| setting.as_str()).collect();
-    assert_eq!(settings, ["time.tau", "surrogate.table_nodes", "transfer.low", "transfer.high", "flow.steps"], "{open:?}");
+    assert_eq!(settings, ["time.tau", "surrogate.table_nodes", "transfer.low", "transfer.high", "flow.steps", "time.every"], "{open:?}");
     // Two nodes a pixel along x, and both ends.
     assert!(open[1][1].starts_with("[129,") && open[1][2].starts_with("two a pixel"), "{open:?}");
     // Sixteen samples a pixel in a single frame are worth a finer table.

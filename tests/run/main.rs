@@ -18,6 +18,7 @@ mod notes;
 mod race;
 mod refine;
 mod scene_file;
+mod snapshots;
 mod stated_error;
 mod steps;
 mod window_memory;

@@ -60,7 +60,8 @@ fn too_few_snapshots() {
     row([
         "too few snapshots",
         &format!("interval {} of a period of 10 (error above 10 %)", fails.0),
-        "summary: `time_resolution.ftle_change`, without every second snapshot",
+        "summary: `time_resolution.ftle_change`, without every second snapshot; of colours, the decision `time.every` (`tests/run/snapshots.rs`: \
+         `a_fast_flow_needs_all_snapshots`)",
         &format!("warns from interval {} on: changes by {:.0} % of the rms FTLE", warned.0, 100.0 * warned.2),
         &format!(
             "{:.0} % at the first warning (map {}); {:.0} % at {} (map {}), where `ftle_change` is {:.0} % and nothing warns",
