@@ -3,7 +3,8 @@
 //!
 //! `-- CONFIG TRUTH_SAMPLES FRAMES [reference] [marched] [two_level] [seeds=N] [until=38dB] [table.key=value]`. The truth is the mean of two
 //! halves of `reference`; the product of the differences to the halves is the squared error without their noise. Lit pixels have an opacity
-//! above 0.01 in the truth, thin ridges are the twentieth of the pixels in which the surrogate of the first frame is most wrong. With `until`
+//! above 0.01 in the truth. Crests are the twentieth of the pixels that are brightest against those around them in the truth, thin ridges the
+//! twentieth in which the surrogate of the first frame is most wrong. With `until`
 //! each picture is drawn by a run with that target, and the errors are those of its last frame.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
@@ -11,7 +12,7 @@
 use ridgewatch::backend::{Device, DeviceChoice, DeviceSettings};
 use ridgewatch::chart::{PictureErrors, Truth, fixed_colours, picture_errors};
 use ridgewatch::config::SceneFile;
-use ridgewatch::render::smooth::{ErrorEstimate, PictureError};
+use ridgewatch::render::smooth::{ErrorEstimate, PictureError, smoothed};
 use ridgewatch::render::{Film, Method, Target, UNTIL_SLACK};
 use ridgewatch::run::{Event, Frame, RunOptions, Settings, Setup, run};
 use std::path::Path;
@@ -20,20 +21,22 @@ use std::sync::atomic::AtomicBool;
 static NEVER: AtomicBool = AtomicBool::new(false);
 /// Standard deviations of a 95 % interval of a normal distribution.
 const Z95: f64 = 1.96;
+/// Radius of what is around a pixel.
+const AROUND: usize = 8;
 
 /// Intervals that hold the true value, lie above it and below it; stated over true root mean squares and stated less true PSNR; widths of the
-/// intervals of the root mean square over the values stated; shares of pixels whose error is within the stated one.
+/// intervals of the root mean square over the values stated; shares of pixels whose error is within the stated one, in the order of [`Measured`].
 #[derive(Clone, Default)]
 struct Held {
     rms: [u32; 3],
     psnr: [u32; 3],
     ratios: Vec<[f64; 2]>,
     widths: Vec<f64>,
-    within: Vec<[f64; 3]>,
+    within: Vec<[f64; 4]>,
 }
 
 impl Held {
-    fn count(&mut self, stated: &PictureError, found: &PictureErrors, within: [f64; 3]) {
+    fn count(&mut self, stated: &PictureError, found: &PictureErrors, within: [f64; 4]) {
         for (counts, interval, found) in [(&mut self.rms, stated.rms, found.rms), (&mut self.psnr, stated.psnr, found.psnr)] {
             counts[if interval.low > found { 1 } else { 2 * usize::from(interval.high < found) }] += 1;
         }
@@ -54,10 +57,12 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// The truth, and pixels: all, lit ones and thin ridges.
+/// The truth, and pixels: all, lit ones, crests and thin ridges.
 struct Measured {
     truth: Truth,
-    pixels: [Vec<usize>; 3],
+    /// Square of the truth's own standard error, mean over the channels and the pixels around.
+    uncertain: Vec<f32>,
+    pixels: [Vec<usize>; 4],
     tone_map: [f64; 3],
 }
 
@@ -78,16 +83,31 @@ impl Measured {
         let all: Vec<usize> = (0..truth.halves[0].rgba.len()).collect();
         let lit = all.iter().copied().filter(|&pixel| truth.is_lit(pixel)).collect();
         let ridges = truth.most_wrong(&film(79, Method::Marched));
-        Self { truth, pixels: [all, lit, ridges], tone_map: scene.render.tone_map }
+        let width = scene.render.width;
+        let apart = |pixel: usize| {
+            let [a, b] = [0, 1].map(|half: usize| truth.halves[half].rgba[pixel]);
+            (0..3).map(|k| (0.5 * (a[k] - b[k])).powi(2)).sum::<f32>() / 3.0
+        };
+        let uncertain = smoothed(&all.iter().map(|&pixel| apart(pixel)).collect::<Vec<_>>(), width, AROUND);
+        let luminances: Vec<f32> = truth.mean.luminances().into_iter().map(|value| value as f32).collect();
+        let around = smoothed(&luminances, width, AROUND);
+        let mut crests = all.clone();
+        crests.sort_by(|&a, &b| (luminances[b] - around[b]).total_cmp(&(luminances[a] - around[a])));
+        crests.truncate(all.len() / 20);
+        Self { truth, uncertain, pixels: [all, lit, crests, ridges], tone_map: scene.render.tone_map }
     }
 
     fn errors(&self, film: &Film) -> PictureErrors {
         picture_errors(film, &self.truth, self.tone_map)
     }
 
-    /// Shares of the pixels whose error is at most `Z95` times what the layer `error` states.
-    fn within(&self, film: &Film) -> [f64; 3] {
-        let holds = |pixel: usize| self.truth.squared_error(film, pixel) <= (Z95 * f64::from(film.error[pixel])).powi(2);
+    /// Shares of the pixels whose error is at most `Z95` times what the layer `error` and the noise of the truth amount to together.
+    fn within(&self, film: &Film) -> [f64; 4] {
+        let holds = |pixel: usize| {
+            let (shown, truth) = (film.rgba[pixel], self.truth.mean.rgba[pixel]);
+            let squared = (0..3).map(|k| f64::from(shown[k] - truth[k]).powi(2)).sum::<f64>() / 3.0;
+            squared <= Z95.powi(2) * (f64::from(film.error[pixel]).powi(2) + f64::from(self.uncertain[pixel]))
+        };
         self.pixels.each_ref().map(|pixels| pixels.iter().filter(|&&pixel| holds(pixel)).count() as f64 / pixels.len() as f64)
     }
 }
@@ -102,7 +122,7 @@ fn frames(settings: &Settings, device: &Device, mut seen: impl FnMut(Frame) + Se
     run(Setup::new(settings.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
 }
 
-fn percent(shares: [f64; 3]) -> String {
+fn percent(shares: [f64; 4]) -> String {
     shares.map(|share| format!("{:.1}", 100.0 * share)).join(", ")
 }
 
@@ -111,7 +131,7 @@ fn table(scene: &Settings, device: &Device, measured: &Measured, (count, seeds):
     let name = scene.render.method.name();
     println!(
         "\n| {name}: seconds | frame, ms: picture, trace, audit | samples | rays | PSNR lit | all | rms | stated PSNR | stated rms | width | march rms | \
-         within, %: all, lit, ridges |"
+         within, %: all, lit, crests, ridges |"
     );
     println!("|{}", "---|".repeat(12));
     let mut held = vec![Held::default(); count];
@@ -131,7 +151,7 @@ fn table(scene: &Settings, device: &Device, measured: &Measured, (count, seeds):
                 sum.accumulate(&frame.film).unwrap();
             }
             let film = if stated.is_some() { &*frame.film } else { &sum };
-            let (true_error, within) = (measured.errors(film), stated.map_or([0.0; 3], |_| measured.within(film)));
+            let (true_error, within) = (measured.errors(film), stated.map_or([0.0; 4], |_| measured.within(film)));
             let samples = stated.map_or(record.samples_per_pixel * (record.frame + 1) as f64, |s| s.samples_per_pixel);
             let stated = stated.unwrap_or_default();
             held[record.frame as usize % count].count(&stated, &true_error, within);
@@ -161,7 +181,7 @@ fn table(scene: &Settings, device: &Device, measured: &Measured, (count, seeds):
     for (frame, held) in held.iter().enumerate().filter(|_| seeds > 1) {
         let Held { rms, psnr, ratios, widths, within } = held;
         let [linear, mapped] = [0, 1].map(|which| median(ratios.iter().map(|ratio| ratio[which])));
-        let shares = [0, 1, 2].map(|which| median(within.iter().map(|within| within[which])));
+        let shares = [0, 1, 2, 3].map(|which| median(within.iter().map(|within| within[which])));
         println!(
             "{name}, frame {frame}: of {seeds} intervals hold, lie above, below: rms {rms:?}, PSNR {psnr:?}; medians: stated over true rms {linear:.2}, \
              stated less true PSNR {mapped:.2} dB, width {:.2}, within {} %",

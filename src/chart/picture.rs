@@ -133,7 +133,8 @@ pub struct PicturePanel {
 pub struct Truth {
     /// The halves.
     pub halves: [Film; 2],
-    mean: Film,
+    /// Mean of both.
+    pub mean: Film,
 }
 
 impl Truth {
@@ -150,13 +151,6 @@ impl Truth {
     /// True if a pixel is lit: its opacity is above [`LIT`].
     pub fn is_lit(&self, pixel: usize) -> bool {
         self.halves[0].rgba[pixel][3] + self.halves[1].rgba[pixel][3] > 2.0 * LIT
-    }
-
-    /// Squared error of a pixel, mean over the channels, linear radiance: the product of the differences to the halves, whose noise has a mean of 0
-    /// in it.
-    pub fn squared_error(&self, film: &Film, pixel: usize) -> f64 {
-        let [shown, a, b] = [film, &self.halves[0], &self.halves[1]].map(|film| film.rgba[pixel]);
-        (0..3).map(|k| f64::from(shown[k] - a[k]) * f64::from(shown[k] - b[k])).sum::<f64>() / 3.0
     }
 
     /// [`most_wrong`] of the picture of a surrogate.

@@ -19,8 +19,7 @@ mod statement;
 mod tone;
 
 pub use allocation::bayer_rank;
-pub(crate) use combine::smoothed;
-pub use combine::{Combined, Correction, PairSums, combine};
+pub use combine::{Combined, Correction, PairSums, combine, smoothed};
 pub use coupled::{CoupledPath, coupled_paths};
 pub use light_volume::{LightGrid, LightVolume, MARGIN};
 pub use march::{RaySum, ToLight};
