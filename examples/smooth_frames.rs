@@ -72,6 +72,8 @@ impl Measured {
             let mut scene = Settings { seed, ..scene.clone() };
             (scene.render.method, scene.render.samples) = (method, samples);
             (scene.render.until, scene.render.budget, scene.time.frames_per_slide) = (None, None, 1);
+            // Majorants that are tight make samples cheaper.
+            (scene.time.warmup_frames, scene.time.warmup_samples) = (1, Some(1));
             if method == Method::Marched {
                 (scene.render.samples, scene.surrogate.refine) = (1.0, false);
             }
