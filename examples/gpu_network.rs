@@ -58,7 +58,9 @@ mod bench {
     use ridgewatch::field::Domain;
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
-    use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
+    use ridgewatch::flow::{
+        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource,
+    };
     use ridgewatch::publish::compare_films;
     use ridgewatch::render::{Film, Method, RenderStats, Renderer, Scene};
     use ridgewatch::run::{Plan, Setup, Slide, settled_colours};
@@ -477,7 +479,7 @@ mod bench {
                 gate: &everywhere,
                 trace_budget: None,
                 keep: 0,
-                arrivals: false,
+                extras: Extras::default(),
             })?;
             self.device.render_samples(renderer, number, 0..self.samples, &mut answers, None, &NEVER)
         }

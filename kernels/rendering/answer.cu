@@ -14,21 +14,23 @@ struct Lists {
     float* points;  // three per entry
     uint32_t* places;
     float* values;
-    const float* arrivals;  // three per entry of the tracer's list; null: not wanted
-    uint32_t* lengths;      // of the surrogate's list and of the tracer's
+    const float* arrivals;   // three per entry of the tracer's list; null: not wanted
+    const float* jacobians;  // nine per entry of the tracer's list; null: not wanted
+    uint32_t* lengths;       // of the surrogate's list and of the tracer's
     uint32_t capacity;
     uint32_t pad;
 };
-static_assert(sizeof(Lists) == 48, "layout");
+static_assert(sizeof(Lists) == 56, "layout");
 
 struct Labels {
-    Float4* at;         // domain point, log-stretch
-    float* arrivals;  // three per label; null: not kept
+    Float4* at;        // domain point, log-stretch
+    float* arrivals;   // three per label; null: not kept
+    float* jacobians;  // nine per label; null: not kept
     uint32_t* length;
     uint32_t capacity;
     uint32_t shift;
 };
-static_assert(sizeof(Labels) == 32, "layout");
+static_assert(sizeof(Labels) == 40, "layout");
 
 extern "C" __global__ void __launch_bounds__(256)
 answer_split(const __grid_constant__ Choice choice, const float* __restrict__ points, uint32_t count, float* __restrict__ log_stretch,
@@ -65,6 +67,6 @@ answer_join(Lists lists, uint32_t predicted, uint32_t traced, float* __restrict_
     const uint32_t label = reserve(labels.length);
     if (label >= labels.capacity) return;
     labels.at[label] = {point[0], point[1], point[2], value};
-    if (!labels.arrivals) return;
-    for (int k = 0; k < 3; ++k) labels.arrivals[3 * (size_t)label + k] = lists.arrivals[3 * (size_t)at + k];
+    for (int k = 0; k < 3 && labels.arrivals; ++k) labels.arrivals[3 * (size_t)label + k] = lists.arrivals[3 * (size_t)at + k];
+    for (int k = 0; k < 9 && labels.jacobians; ++k) labels.jacobians[9 * (size_t)label + k] = lists.jacobians[9 * (size_t)at + k];
 }

@@ -203,7 +203,7 @@ impl<'a> QueryRouter<'a> {
     }
 }
 
-/// Appends traced seed `i` to `samples` in unit coordinates. The Jacobian is scaled to unit coordinates on both sides.
+/// Appends traced seed `i` to `samples` in unit coordinates.
 pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: DomainPoint, traced: &Traced, i: usize, extras: Extras) {
     samples.points.push(domain.to_unit(point));
     samples.log_stretch.push(traced.log_stretch[i]);
@@ -211,9 +211,14 @@ pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: DomainP
         samples.arrival.push(domain.to_unit_unclamped(traced.arrival[i]));
     }
     if extras.jacobian {
-        let (j, extent) = (traced.jacobian[i], domain.extent());
-        samples.jacobian.push(std::array::from_fn(|e| (f64::from(j[e]) * extent[e % 3] / extent[e / 3]) as f32));
+        samples.jacobian.push(unit_jacobian(domain, &traced.jacobian[i]));
     }
+}
+
+/// A Jacobian in domain coordinates, row-major, in unit coordinates.
+pub(super) fn unit_jacobian(domain: &Domain, jacobian: &[f32; 9]) -> [f32; 9] {
+    let extent = domain.extent();
+    std::array::from_fn(|e| (f64::from(jacobian[e]) * extent[e % 3] / extent[e / 3]) as f32)
 }
 
 impl QueryRouter<'_> {

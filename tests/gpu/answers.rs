@@ -122,7 +122,7 @@ impl Stage {
                 gate: &self.gate,
                 trace_budget: how.budget,
                 keep: how.keep,
-                arrivals: how.label_sink.is_some(),
+                extras: Extras { arrival: how.label_sink.is_some(), jacobian: how.label_sink.is_some() },
             })
             .unwrap();
         let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut routed, None, &NEVER).unwrap();
@@ -293,20 +293,23 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
 }
 
 /// Keeps what it is told to learn from.
-struct Heard(RefCell<Vec<(DomainPoint, f32, DomainPoint)>>);
+struct Heard(RefCell<Vec<(DomainPoint, f32, DomainPoint, [f32; 9])>>);
 
 impl DeviceLearns for Heard {
     unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
         let (mut at, mut values, mut arrivals) =
             (vec![DomainPoint::default(); count], vec![0.0_f32; count], vec![DomainPoint::default(); count]);
+        let mut jacobians = vec![[0.0_f32; 9]; count];
         gpu().synchronize()?;
         // SAFETY: the caller's; the work that wrote them is done.
         unsafe {
             cudarc::driver::result::memcpy_dtoh_sync(bytemuck::cast_slice_mut::<_, f32>(&mut at), points).unwrap();
             cudarc::driver::result::memcpy_dtoh_sync(&mut values, traced.log_stretch).unwrap();
             cudarc::driver::result::memcpy_dtoh_sync(bytemuck::cast_slice_mut::<_, f32>(&mut arrivals), traced.arrival).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(&mut jacobians, traced.jacobian).unwrap();
         }
-        self.0.borrow_mut().extend(at.into_iter().zip(values).zip(arrivals).map(|((at, value), arrival)| (at, value, arrival)));
+        let labels = at.into_iter().zip(values).zip(arrivals).zip(jacobians);
+        self.0.borrow_mut().extend(labels.map(|(((at, value), arrival), jacobian)| (at, value, arrival, jacobian)));
         Ok(())
     }
 }
@@ -325,12 +328,16 @@ fn what_stays_on_the_device_is_what_was_traced() {
     assert_eq!(heard.len() as u64, tally.traced);
     // As traced on the host: in the unit coordinates of labels, which do not end at the domain's edges.
     let domain = stage.domain();
-    let bits = |point: UnitPoint, value: f32, arrival: UnitPoint| (point.0.map(f32::to_bits), value.to_bits(), arrival.0.map(f32::to_bits));
+    let bits = |point: UnitPoint, value: f32, arrival: UnitPoint, jacobian: [f32; 9]| {
+        (point.0.map(f32::to_bits), value.to_bits(), arrival.0.map(f32::to_bits), jacobian.map(f32::to_bits))
+    };
+    let extent = domain.extent();
+    let in_units = |jacobian: [f32; 9]| std::array::from_fn(|e| (f64::from(jacobian[e]) * extent[e % 3] / extent[e / 3]) as f32);
     let mut held_back: Vec<_> = (heard.iter().filter(|(point, ..)| keeps_label(*point, 3)))
-        .map(|&(point, value, there)| bits(domain.to_unit(point), value, domain.to_unit_unclamped(there)))
+        .map(|&(point, value, there, jacobian)| bits(domain.to_unit(point), value, domain.to_unit_unclamped(there), in_units(jacobian)))
         .collect();
-    let mut back: Vec<_> = (labels.points.iter().zip(&labels.log_stretch).zip(&labels.arrival))
-        .map(|((&point, &value), &arrival)| bits(point, value, arrival))
+    let mut back: Vec<_> = (labels.points.iter().zip(&labels.log_stretch).zip(&labels.arrival).zip(&labels.jacobian))
+        .map(|(((&point, &value), &arrival), &jacobian)| bits(point, value, arrival, jacobian))
         .collect();
     held_back.sort_unstable();
     back.sort_unstable();

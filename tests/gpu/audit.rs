@@ -21,7 +21,7 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
     let settings = TransferSettings { low: Some(0.1), high: Some(0.3), ..TransferSettings::default() };
     let transfer = Transfer::new(&settings, 1.0).unwrap();
     let mut audits = Audits::new(&gpu).unwrap();
-    for (stream, samples) in [(0, None), (1, Some(Extras { arrival: true, jacobian: false })), (1 << 40, Some(Extras::default()))] {
+    for (stream, samples) in [(0, None), (1, Some(Extras { arrival: true, jacobian: true })), (1 << 40, Some(Extras::default()))] {
         let request =
             AuditRequest { strata: strata.clone(), seed: 77, stream, transfer: &transfer, samples, stop: &AtomicBool::new(false) };
         let expected = audit(&request, &tracer, Some(&frozen)).unwrap();
@@ -34,6 +34,9 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
         assert_eq!(found.samples.points, expected.samples.points);
         assert_eq!(found.samples.log_stretch, expected.samples.log_stretch);
         assert_eq!(found.samples.arrival, expected.samples.arrival);
+        let jacobians =
+            [&found, &expected].map(|findings| findings.samples.jacobian.iter().map(|j| j.map(f32::to_bits)).collect::<Vec<_>>());
+        assert_eq!(jacobians[0], jacobians[1]);
         let [found, expected] = [found, expected].map(|findings| findings.errors.unwrap());
         let bits = |cell: &CellErrors| {
             let CellErrors { count, optical, square, fourth, second, third, log_square } = *cell;

@@ -192,6 +192,7 @@ pub struct ListsArgument {
     pub places: u64,
     pub values: u64,
     pub arrivals: u64,
+    pub jacobians: u64,
     pub lengths: u64,
     pub capacity: u32,
     pub pad: u32,
@@ -203,6 +204,7 @@ pub struct ListsArgument {
 pub struct LabelsArgument {
     pub at: u64,
     pub arrivals: u64,
+    pub jacobians: u64,
     pub length: u64,
     pub capacity: u32,
     pub shift: u32,
@@ -288,7 +290,7 @@ mod tests {
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
         // static_asserts in the kernels' sources have the same numbers.
         assert_eq!((size_of::<TableArgument>(), size_of::<MissingCellsArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));
-        assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (48, 32));
+        assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (56, 40));
         assert_eq!((size_of::<AuditDrawArgument>(), size_of::<AuditBatchArgument>()), (176, 16));
         assert_eq!((size_of::<AuditPointsArgument>(), size_of::<CellFindings>()), (56, 80));
     }

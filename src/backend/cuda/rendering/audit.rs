@@ -7,8 +7,10 @@ use crate::audit::{AuditFindings, AuditRequest, draws};
 use crate::cuda::driver::pinned::Pinned;
 use crate::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
 use crate::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
+use crate::router::unit_jacobian;
 use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
+use ridgewatch_flow::Extras;
 use ridgewatch_surrogate::Samples;
 use ridgewatch_trust::Audited;
 use std::ops::Range;
@@ -36,6 +38,8 @@ struct Memory {
     lifetime_share: Buffer<f32>,
     /// `None` until arrival points are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
+    /// `None` until Jacobians are requested.
+    jacobians: Option<Buffer<[f32; 9]>>,
     predicted: Buffer<f32>,
     optical: Buffer<f32>,
     begins: Buffer<u32>,
@@ -54,6 +58,7 @@ impl Memory {
             traced: gpu.alloc(what, points)?,
             lifetime_share: gpu.alloc(what, points)?,
             arrivals: None,
+            jacobians: None,
             predicted: gpu.alloc(what, points)?,
             optical: gpu.alloc(what, points)?,
             begins: gpu.alloc(what, cells + 1)?,
@@ -93,8 +98,7 @@ impl Audits {
         Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// Audits a frame. The result is bitwise that of [`crate::audit::audit`] if traced and predicted values are equal. The samples have no
-    /// Jacobians.
+    /// Audits a frame. The result is bitwise that of [`crate::audit::audit`] if traced and predicted values are equal.
     ///
     /// # Errors
     /// The device fails or lacks memory.
@@ -123,11 +127,15 @@ impl Audits {
         };
         memory.begins.write(&begins)?;
         let gpu = &self.gpu;
-        let arrivals = request.samples.is_some_and(|extras| extras.arrival);
-        if arrivals && memory.arrivals.is_none() {
+        let extras = request.samples.unwrap_or_default();
+        if extras.arrival && memory.arrivals.is_none() {
             memory.arrivals = Some(gpu.alloc("audit points", memory.unit.len())?);
         }
-        let arrival = memory.arrivals.as_ref().filter(|_| arrivals).map_or(0, Buffer::address);
+        if extras.jacobian && memory.jacobians.is_none() {
+            memory.jacobians = Some(gpu.alloc("audit points", memory.unit.len())?);
+        }
+        let arrival = memory.arrivals.as_ref().filter(|_| extras.arrival).map_or(0, Buffer::address);
+        let jacobian = memory.jacobians.as_ref().filter(|_| extras.jacobian).map_or(0, Buffer::address);
         let stream = gpu.work();
         let (key, stream_words) = draws(request.seed, request.stream);
         let domain = tracer.host().domain();
@@ -155,21 +163,19 @@ impl Audits {
             let argument = AuditBatchArgument { begins: memory.begins.address(), first: batch.start as u32, count: batch.len() as u32 };
             let warps = threads(batch.len() * WARP, 256);
             let findings = memory.findings.address();
+            let traced =
+                Outputs { log_stretch: points.traced, lifetime_share: points.lifetime_share, arrival, jacobian, ..Outputs::default() };
             // SAFETY: arguments as declared in audit.cu; all arrays hold the points of the batch, and `begins` and `findings` hold every cell.
             unsafe {
                 launch(stream.launch_builder(&self.draw).arg(&draw).arg(&argument).arg(&points), warps)?;
-                tracer.device().trace(
-                    points.points,
-                    count,
-                    &Outputs { log_stretch: points.traced, lifetime_share: points.lifetime_share, arrival, ..Outputs::default() },
-                )?;
+                tracer.device().trace(points.points, count, &traced)?;
                 predictor.predict(points.unit, count, points.predicted)?;
                 let mut call = stream.launch_builder(&self.measure);
                 launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
                 memory.optical_back.copy_from(gpu.work(), points.optical, count)?;
             }
             if request.samples.is_some() {
-                keep(memory, count, arrivals.then_some(domain), &mut samples)?;
+                keep(memory, count, domain, extras, &mut samples)?;
             }
             gpu.synchronize()?;
             optical.extend_from_slice(&memory.optical_back.values()[..count]);
@@ -191,9 +197,8 @@ impl Audits {
     }
 }
 
-/// Reads back the points of a batch that lie outside missing cells. With `arrivals_in`, also their arrival points in unit coordinates of that
-/// domain.
-fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &mut Samples) -> Result<(), DeviceError> {
+/// Reads back the points of a batch that lie outside missing cells, in unit coordinates of `domain`.
+fn keep(memory: &Memory, count: usize, domain: &Domain, extras: Extras, samples: &mut Samples) -> Result<(), DeviceError> {
     fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
         let mut values = vec![zero; count];
         from.read(&mut values)?;
@@ -204,9 +209,13 @@ fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &m
     let present = || (0..count).filter(|&i| missing[i] == 0);
     samples.points.extend(present().map(|i| UnitPoint(unit[i])));
     samples.log_stretch.extend(present().map(|i| traced[i]));
-    if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
+    if let Some(buffer) = memory.arrivals.as_ref().filter(|_| extras.arrival) {
         let arrivals = back(buffer, [0.0; 3], count)?;
         samples.arrival.extend(present().map(|i| domain.to_unit_unclamped(DomainPoint(arrivals[i]))));
+    }
+    if let Some(buffer) = memory.jacobians.as_ref().filter(|_| extras.jacobian) {
+        let jacobians = back(buffer, [0.0; 9], count)?;
+        samples.jacobian.extend(present().map(|i| unit_jacobian(domain, &jacobians[i])));
     }
     Ok(())
 }

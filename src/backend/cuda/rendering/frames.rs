@@ -109,7 +109,7 @@ impl GpuFrames {
             gate: routing.gate,
             trace_budget: routing.trace_budget,
             keep: routing.keep,
-            arrivals: routing.extras.arrival,
+            extras: routing.extras,
         })?;
         let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut answers, progress, job.stop)?;
         let tally = Tally {
@@ -161,7 +161,7 @@ impl GpuFrames {
                 gate: &nothing_trusted,
                 trace_budget: None,
                 keep: routing.keep,
-                arrivals: routing.extras.arrival,
+                extras: routing.extras,
             })?;
             let refined = own.refine(&round, renderer, &mut answers)?;
             labels.host = answers.labels();

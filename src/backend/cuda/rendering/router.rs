@@ -11,6 +11,7 @@ use crate::cuda::rendering::labels::{HELD_BACK, Labels};
 use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, PushKernelArg, result};
 use ridgewatch_field::Domain;
+use ridgewatch_flow::Extras;
 use ridgewatch_surrogate::Samples;
 use ridgewatch_trust::Gate;
 use std::sync::Arc;
@@ -96,8 +97,8 @@ pub struct FrameQueries<'a> {
     pub trace_budget: Option<f64>,
     /// Upper bound (exclusive) on the labels that are read back to the host, at most 4,194,304.
     pub keep: usize,
-    /// True if labels include arrival points.
-    pub arrivals: bool,
+    /// What labels have besides the log-stretch.
+    pub extras: Extras,
 }
 
 /// Limit on the points of a batch.
@@ -120,6 +121,8 @@ struct Memory {
     values: Buffer<f32>,
     /// Arrival points of the traced queries. `None` until they are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
+    /// Their Jacobians. `None` until they are requested.
+    jacobians: Option<Buffer<[f32; 9]>>,
     /// Lengths of the list to predict, of the list to trace, and of the labels.
     lengths: Buffer<u32>,
     pinned: Pinned<u32>,
@@ -135,6 +138,7 @@ impl Memory {
             places: gpu.alloc(what, capacity)?,
             values: gpu.alloc(what, capacity)?,
             arrivals: None,
+            jacobians: None,
             lengths: gpu.alloc(what, 3)?,
             pinned: Pinned::new(gpu.context(), 3)?,
         })
@@ -184,8 +188,11 @@ impl DeviceQueryRouter {
         };
         let memory = self.memory.insert(memory);
         memory.lengths.fill_bytes(0)?;
-        if queries.arrivals && memory.arrivals.is_none() {
+        if queries.extras.arrival && memory.arrivals.is_none() {
             memory.arrivals = Some(gpu.alloc("the lists of a gated frame", memory.capacity)?);
+        }
+        if queries.extras.jacobian && memory.jacobians.is_none() {
+            memory.jacobians = Some(gpu.alloc("the lists of a gated frame", memory.capacity)?);
         }
         let trusted: Vec<u8> = queries.gate.cells().iter().map(|&trusted| u8::from(trusted)).collect();
         let trusted = queries.surrogate.map(|_| gpu.upload("a gate", &trusted)).transpose()?;
@@ -200,7 +207,7 @@ impl DeviceQueryRouter {
             pad: 0,
         };
         Ok(RoutedQueries {
-            labels: Labels::new(&gpu, queries.keep, if queries.label_sink.is_some() { HELD_BACK } else { 0 }, queries.arrivals)?,
+            labels: Labels::new(&gpu, queries.keep, if queries.label_sink.is_some() { HELD_BACK } else { 0 }, queries.extras)?,
             split: &self.split,
             join: &self.join,
             memory,
@@ -271,7 +278,8 @@ impl RoutedQueries<'_> {
             points: self.memory.points.address(),
             places: self.memory.places.address(),
             values: self.memory.values.address(),
-            arrivals: self.memory.arrivals.as_ref().filter(|_| self.queries.arrivals).map_or(0, Buffer::address),
+            arrivals: self.memory.arrivals.as_ref().filter(|_| self.queries.extras.arrival).map_or(0, Buffer::address),
+            jacobians: self.memory.jacobians.as_ref().filter(|_| self.queries.extras.jacobian).map_or(0, Buffer::address),
             lengths: self.memory.lengths.address(),
             capacity: capacity as u32,
             pad: 0,
@@ -292,7 +300,8 @@ impl RoutedQueries<'_> {
         let answered = gpu.mark()?;
         let back = (capacity - traced) as u64;
         let arrival = if lists.arrivals == 0 { 0 } else { lists.arrivals + 12 * back };
-        let out = Outputs { log_stretch: lists.values + 4 * back, arrival, ..Outputs::default() };
+        let jacobian = if lists.jacobians == 0 { 0 } else { lists.jacobians + 36 * back };
+        let out = Outputs { log_stretch: lists.values + 4 * back, arrival, jacobian, ..Outputs::default() };
         // SAFETY: as above, with `traced` entries at the back of each list.
         unsafe { self.queries.tracer.trace(lists.points + 12 * back, traced, &out) }?;
         let tracing = gpu.mark()?;
