@@ -5,7 +5,7 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::backend::cuda::compile::{Request, SOURCES};
-use ridgewatch::backend::cuda::{Tiling, is_fused, network_defines};
+use ridgewatch::backend::cuda::{LossTerms, Tiling, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings, Target};
 
 /// Macros of the gridded kernel: the usual ones with changes.
@@ -50,20 +50,23 @@ fn networks() -> Vec<Network> {
         (NetworkSettings { target: Target::FlowMap, encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..usual }, &[0, 1, 2]),
     ];
     let shape = |(settings, axes): &(NetworkSettings, &[usize])| Architecture::new(settings, axes, [1.0; 3]).unwrap();
-    let all = settings.iter().map(|settings| Network { shape: shape(settings), penalty: false });
-    // One fused and one batched network.
-    all.chain([0, 6].map(|number| Network { shape: shape(&settings[number]), penalty: true })).collect()
+    let with = |number: usize, terms: LossTerms| Network { shape: shape(&settings[number]), terms };
+    let all = (0..settings.len()).map(|number| with(number, LossTerms::default()));
+    // Fused and batched networks.
+    let penalty = [0, 6].map(|number| with(number, LossTerms { mean_penalty: true, derivatives: false }));
+    let derivatives = [11, 12, 13, 14].map(|number| with(number, LossTerms { mean_penalty: false, derivatives: true }));
+    all.chain(penalty).chain(derivatives).collect()
 }
 
-/// An architecture, with or without a penalty on means in its loss.
+/// An architecture, and what its loss has.
 struct Network {
     shape: Architecture,
-    penalty: bool,
+    terms: LossTerms,
 }
 
 impl Network {
     fn defines(&self) -> Vec<String> {
-        network_defines(&self.shape, self.penalty).unwrap()
+        network_defines(&self.shape, self.terms).unwrap()
     }
 }
 

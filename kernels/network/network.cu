@@ -78,44 +78,13 @@ network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t f
     }
 }
 
-// Turns traced points (domain coordinates) and their labels into samples. From a log-stretch the target is its difference to `base`, scaled;
-// from an arrival (domain coordinates, 3 floats each) it is the scaled displacement (see Objective::targets). One point in 2^held_back gets no
-// target, since the host may keep it for validation; with 0 all points get one.
+// Turns traced points and their labels into samples, as `write_sample` does. One thread per point.
 extern "C" __global__ void __launch_bounds__(256)
 network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ Reading reading, const float* __restrict__ points,
-                const float* __restrict__ labels, uint32_t n, uint32_t held_back, Float4* __restrict__ samples) {
+                const float* __restrict__ labels, uint32_t n, uint32_t held_back, Float4* __restrict__ samples,
+                const float* __restrict__ jacobians) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
-    if (i >= n) return;
-    const float point[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
-    float unit[3];
-    to_unit(domain, point, unit);
-    Sample sample;
-    read_point(reading, points, i, sample.place);
-    RW_UNROLL for (int k = 0; k < 3; ++k) sample.place[k] = unit[k];
-#if RW_FLOW_MAP
-    const int axes[DIMS] = {RW_AXES};
-    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) {
-        const int axis = axes[k];
-        const float arrival = float((double(labels[3 * size_t(i) + axis]) - domain.min[axis]) / domain.extent[axis]);
-        sample.target[k] = (arrival - unit[axis] - reading.mean[k]) / reading.deviation[k];
-    }
-#else
-    if (reading.published) {
-        const float y = labels[i] / reading.tau;
-        sample.target[0] = copysignf(log1pf(fabsf(y)), y);
-    } else {
-        const float below = reading.base.values ? look_up_base(reading, sample.place) : 0.0f;
-        sample.target[0] = (labels[i] - below - reading.mean[0]) / reading.deviation[0];
-    }
-#endif
-    float all = point[0] + point[1] + point[2];
-    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) all += sample.target[k];
-    // A point that is not finite gets no target.
-    if (!is_finite(all) || (held_back && keeps_label(point, held_back))) {
-        RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) sample.target[k] = not_a_number();
-    }
-    place_times(reading, sample.place);
-    store_sample(samples + i * size_t(SAMPLE_FLOAT4S), sample);
+    if (i < n) write_sample(domain, reading, points, labels, jacobians, i, held_back, samples);
 }
 
 // Adds the number of samples with targets to `count`.

@@ -9,8 +9,8 @@
 // Macros: RW_DIMS, number of inputs; RW_AXES, their places in a sample (axes have their own, times take those of unused axes, then further
 // ones); RW_SPACE, number of inputs that are axes, which come first; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH, neurons of a
 // hidden layer; RW_HIDDEN, number of hidden layers; RW_FLOW_MAP (1: one output per axis, whose derivatives along the axes are the gradient of
-// the flow map; 0: one output); RW_PENALTY (1: the loss has a penalty on batch means); RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, shared memory of
-// prediction and of training.
+// the flow map; 0: one output); RW_DERIVATIVES (1: the loss has these derivatives); RW_PENALTY (1: the loss has a penalty on batch means);
+// RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, shared memory of prediction and of training.
 #pragma once
 #include "common/base.cuh"
 
@@ -23,6 +23,7 @@ inline void sincospif(float x, float* sine, float* cosine) {
     *sine = float(std::sin(3.14159265358979323846 * double(x)));
     *cosine = float(std::cos(3.14159265358979323846 * double(x)));
 }
+inline void atomicAdd(float* at, float x) { *at += x; }
 #endif
 
 namespace rw {
@@ -145,21 +146,55 @@ RW_FN float half_turns(const float (&point)[DIMS], int column) {
 }
 #endif
 
-// Columns `column` and `column + 1` of an encoded point.
-RW_FN float2 encode([[maybe_unused]] const Level* levels, [[maybe_unused]] const Features& features, const float (&point)[DIMS], int column) {
+// A group of rows: the encoded points themselves.
+struct Values {
+#if RW_LEVELS > 0
+    RW_FN Cell cell(const Level& level, const float (&point)[DIMS]) const { return locate(level, point); }
+#else
+    RW_FN float2 wave(float sine, float cosine, int) const { return make_float2(sine, cosine); }
+#endif
+};
+
+// A group of rows: tangents of the encoded points, `step` times their derivatives along an axis.
+struct Tangents {
+    int along;
+    float step;
+
+#if RW_LEVELS > 0
+    RW_FN Cell cell(const Level& level, const float (&point)[DIMS]) const {
+        const Sides at = sides(level, point);
+        Cell cell = corners(level, at);
+        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) cell.weight[corner] = step * weight_slope(level, at, corner, along);
+        return cell;
+    }
+#else
+    RW_FN float2 wave(float sine, float cosine, int column) const {
+        const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
+        const float rate = axis == along ? 3.14159265f * step * float(1u << octave) : 0.0f;
+        return make_float2(rate * cosine, -rate * sine);
+    }
+#endif
+};
+
+// Columns `column` and `column + 1` of an encoded point, or of its tangent.
+template <class Group = Values>
+RW_FN float2 encode([[maybe_unused]] const Level* levels, [[maybe_unused]] const Features& features, const float (&point)[DIMS], int column,
+                    Group group = Group()) {
     if (column >= ENCODED) return make_float2(0.0f, 0.0f);
     float2 sum = make_float2(0.0f, 0.0f);
 #if RW_LEVELS == 0
-    sincospif(half_turns(point, column), &sum.x, &sum.y);
+    float sine, cosine;
+    sincospif(half_turns(point, column), &sine, &cosine);
+    sum = group.wave(sine, cosine, column);
 #elif RW_FEATURES == 1
     auto add_level = [&](int number, float& sum) {
-        const Cell cell = locate(levels[number], point);
+        const Cell cell = group.cell(levels[number], point);
         RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) sum = fma_(cell.weight[corner], features.single(cell.index[corner]), sum);
     };
     add_level(column, sum.x);
     if (column + 1 < ENCODED) add_level(column + 1, sum.y);
 #else
-    const Cell cell = locate(levels[column / FEATURES], point);
+    const Cell cell = group.cell(levels[column / FEATURES], point);
     RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
         const float2 pair = features.pair(cell.index[corner], column % FEATURES);
         sum.x = fma_(cell.weight[corner], pair.x, sum.x);
@@ -214,6 +249,52 @@ RW_FN void encode_tangents(float2 (&sums)[GROUPS], [[maybe_unused]] const Level*
 #endif
 }
 
+#endif
+
+RW_FN void add(float* at, float x, float y) {
+#if __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float2*>(at), make_float2(x, y));
+#else
+    atomicAdd(at, x);
+    atomicAdd(at + 1, y);
+#endif
+}
+
+#if RW_LEVELS > 0
+// Adds the gradient of columns `column` and `column + 1` to the table entries from which they, or their tangents, were interpolated.
+template <class Group = Values>
+RW_FN void scatter(const Level* levels, const float (&point)[DIMS], int column, float x, float y, float* __restrict__ gradient,
+                   Group group = Group()) {
+    if (column >= ENCODED) return;
+#if RW_FEATURES == 1
+    auto add_level = [&](int number, float value) {
+        const Cell cell = group.cell(levels[number], point);
+        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) atomicAdd(gradient + cell.index[corner], cell.weight[corner] * value);
+    };
+    add_level(column, x);
+    if (column + 1 < ENCODED) add_level(column + 1, y);
+#else
+    const Cell cell = group.cell(levels[column / FEATURES], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; corner += 2) {
+        const uint32_t index = cell.index[corner], next = cell.index[corner + 1];
+        const float a = cell.weight[corner], b = cell.weight[corner + 1];
+#if RW_FEATURES == 2 && __CUDA_ARCH__ >= 900
+        // Both ends of an edge along the first axis are often adjacent in memory: one request instead of two.
+        if ((index ^ next) == 1u) {
+            const float low = index & 1u ? b : a, high = index & 1u ? a : b;
+            atomicAdd(reinterpret_cast<float4*>(gradient + 2 * size_t(index & ~1u)), make_float4(low * x, low * y, high * x, high * y));
+            continue;
+        }
+#endif
+        add(gradient + size_t(index) * FEATURES + column % FEATURES, a * x, a * y);
+        add(gradient + size_t(next) * FEATURES + column % FEATURES, b * x, b * y);
+    }
+#endif
+}
+
+#else
+// Frequencies have no tables.
+template <class Group = Values> RW_FN void scatter(const Level*, const float (&)[DIMS], int, float, float, float*, Group = Group()) {}
 #endif
 
 #if RW_DEVICE
@@ -303,11 +384,13 @@ RW_FN void read_layers(Weights& weights, const float* __restrict__ layers) {
     __syncthreads();
 }
 
-// Encodes the warp's 16 points; each lane passes the two points of its rows.
-RW_FN void encode_rows(Rows<ENCODED_BLOCKS>& rows, const Level* levels, const Features& features, const float (&points)[2][DIMS]) {
+// Encodes the warp's 16 points, or their tangents; each lane passes the two points of its rows.
+template <class Group = Values>
+RW_FN void encode_rows(Rows<ENCODED_BLOCKS>& rows, const Level* levels, const Features& features, const float (&points)[2][DIMS],
+                       Group group = Group()) {
     RW_UNROLL for (int block = 0; block < ENCODED_BLOCKS; ++block) {
         RW_UNROLL for (int part = 0; part < 4; ++part) {
-            const float2 pair = encode(levels, features, points[part & 1], 16 * block + 8 * (part >> 1) + 2 * int(lane() & 3u));
+            const float2 pair = encode(levels, features, points[part & 1], 16 * block + 8 * (part >> 1) + 2 * int(lane() & 3u), group);
             rows.block[block][part] = pack(pair.x, pair.y);
         }
     }
@@ -325,47 +408,6 @@ RW_FN void encode_rows(Rows<ENCODED_BLOCKS> (&rows)[GROUPS], const Level* levels
         }
     }
 }
-#endif
-
-RW_FN void add(float* at, float x, float y) {
-#if __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<float2*>(at), make_float2(x, y));
-#else
-    atomicAdd(at, x);
-    atomicAdd(at + 1, y);
-#endif
-}
-
-#if RW_LEVELS > 0
-// Adds the gradient of columns `column` and `column + 1` to the table entries from which they were interpolated.
-RW_FN void scatter(const Level* levels, const float (&point)[DIMS], int column, float x, float y, float* __restrict__ gradient) {
-    if (column >= ENCODED) return;
-#if RW_FEATURES == 1
-    auto add_level = [&](int number, float value) {
-        const Cell cell = locate(levels[number], point);
-        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) atomicAdd(gradient + cell.index[corner], cell.weight[corner] * value);
-    };
-    add_level(column, x);
-    if (column + 1 < ENCODED) add_level(column + 1, y);
-#else
-    const Cell cell = locate(levels[column / FEATURES], point);
-    RW_UNROLL for (int corner = 0; corner < CORNERS; corner += 2) {
-        const uint32_t index = cell.index[corner], next = cell.index[corner + 1];
-        const float a = cell.weight[corner], b = cell.weight[corner + 1];
-#if RW_FEATURES == 2 && __CUDA_ARCH__ >= 900
-        // Both ends of an edge along the first axis are often adjacent in memory: one request instead of two.
-        if ((index ^ next) == 1u) {
-            const float low = index & 1u ? b : a, high = index & 1u ? a : b;
-            atomicAdd(reinterpret_cast<float4*>(gradient + 2 * size_t(index & ~1u)), make_float4(low * x, low * y, high * x, high * y));
-            continue;
-        }
-#endif
-        add(gradient + size_t(index) * FEATURES + column % FEATURES, a * x, a * y);
-        add(gradient + size_t(next) * FEATURES + column % FEATURES, b * x, b * y);
-    }
-#endif
-}
-
 #endif
 
 // sums += rows * matrix, where matrix has 16 * IN rows and 16 * WIDTH_BLOCKS columns.
@@ -418,13 +460,36 @@ RW_FN void activate(Rows<WIDTH_BLOCKS>& rows, const Sums<2 * WIDTH_BLOCKS>& sums
     }
 }
 
-// Backpropagation through the ReLU: `from` where `passed` is not 0, else 0.
-RW_FN void relu_mask(Rows<WIDTH_BLOCKS>& delta, const Rows<WIDTH_BLOCKS>& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
+// Which values of a layer are not 0, in one bit each.
+struct Passed {
+    uint32_t words[(WIDTH_BLOCKS + 3) / 4];
+
+    static RW_FN constexpr int bit(int n, int part) { return 8 * (n % 4) + 2 * part; }
+    Passed() = default;
+    RW_FN explicit Passed(const Rows<WIDTH_BLOCKS>& values) : words() {
+        RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
+            RW_UNROLL for (int part = 0; part < 4; ++part) {
+                const uint32_t pair = values.block[n][part];
+                words[n / 4] |= ((pair & 0x00007fffu ? 1u : 0u) | (pair & 0x7fff0000u ? 2u : 0u)) << bit(n, part);
+            }
+        }
+    }
+};
+
+// Whether the ReLU passed the values of a pair: not 0 in the lower and in the upper half if it did.
+RW_FN uint32_t passed_pair(const Rows<WIDTH_BLOCKS>& values, int n, int part) { return values.block[n][part] & 0x7fff7fffu; }
+RW_FN uint32_t passed_pair(const Passed& passed, int n, int part) {
+    const uint32_t both = passed.words[n / 4] >> Passed::bit(n, part);
+    return (both & 1u) | (both & 2u) << 15;
+}
+
+// Backpropagation through the ReLU, and tangents through it: `from` where `passed` is not 0, else 0.
+template <class Mask> RW_FN void relu_mask(Rows<WIDTH_BLOCKS>& delta, const Mask& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
     RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
         RW_UNROLL for (int part = 0; part < 4; ++part) {
             const float(&sums)[4] = from.block[2 * n + (part >> 1)];
-            const uint32_t active = passed.block[n][part];
-            delta.block[n][part] = pack(active & 0x00007fffu ? sums[2 * (part & 1)] : 0.0f, active & 0x7fff0000u ? sums[2 * (part & 1) + 1] : 0.0f);
+            const uint32_t active = passed_pair(passed, n, part);
+            delta.block[n][part] = pack(active & 0x0000ffffu ? sums[2 * (part & 1)] : 0.0f, active & 0xffff0000u ? sums[2 * (part & 1) + 1] : 0.0f);
         }
     }
 }
@@ -467,24 +532,24 @@ RW_FN void layers_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& encod
     add_head(outputs, rows[HIDDEN - 1], weights);
 }
 
-// Propagates a tangent through all layers; the ReLU passes it where the value in `passed` is not 0.
-RW_FN void tangent_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& encoded, const Rows<WIDTH_BLOCKS> (&passed)[HIDDEN],
+// Propagates a tangent through all layers; the ReLU passes it where the value in `passed` is not 0. `rows` keeps the tangents of each layer.
+template <class Mask>
+RW_FN void tangent_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& encoded, Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Mask& passed,
                            const Weights& weights) {
-    Rows<WIDTH_BLOCKS> rows;
     {
         Sums<2 * WIDTH_BLOCKS> sums;
         clear(sums);
         add_product(sums, encoded, weights.first);
-        relu_mask(rows, passed[0], sums);
+        relu_mask(rows[0], passed[0], sums);
     }
     RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) {
         Sums<2 * WIDTH_BLOCKS> sums;
         clear(sums);
-        add_product(sums, rows, weights.hidden[layer - 1]);
-        relu_mask(rows, passed[layer], sums);
+        add_product(sums, rows[layer - 1], weights.hidden[layer - 1]);
+        relu_mask(rows[layer], passed[layer], sums);
     }
     RW_UNROLL for (int k = 0; k < 4; ++k) outputs[k] = 0.0f;
-    add_head(outputs, rows, weights);
+    add_head(outputs, rows[HIDDEN - 1], weights);
 }
 
 #endif

@@ -295,7 +295,7 @@ RW_FN void backward_tile(Tile& tile, Stream& stream, const uint32_t* passed, flo
 }
 
 #if RW_FLOW_MAP
-// Tangents of a layer's values, from those of the previous layer.
+// Tangents of a layer's values, from those of the previous layer; or the gradient with respect to a layer's tangents, from that of the next layer.
 RW_FN void tangent_tile(Tile& tile, Stream& stream, int depth, const uint32_t* passed) {
     masked_tile(tile, stream, depth, passed, [](int, float2) {});
 }
@@ -310,21 +310,13 @@ RW_FN float head_weight(const float* __restrict__ head, int column, int output) 
     return column < WIDTH ? from_half(to_half(head[column * OUTPUTS + output])) : 0.0f;
 }
 
-// Encodes the tile's samples; with GROUP above 0, their tangents along axis GROUP - 1.
-template <int GROUP = 0> RW_FN void encode_tile(Tile& tile, const uint16_t* tables, [[maybe_unused]] float step = 1.0f) {
+// Encodes the tile's samples, or their tangents.
+template <class Group = Values> RW_FN void encode_tile(Tile& tile, const uint16_t* tables, Group group = Group()) {
     for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
         const int row = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
         float point[DIMS];
         inputs(point, tile.samples[row].place);
-        float2 pair;
-#if RW_FLOW_MAP
-        if constexpr (GROUP > 0) {
-            float2 pairs[GROUPS];
-            encode_tangents(pairs, tile.levels, {tables}, point, column, step);
-            pair = pairs[GROUP];
-        } else
-#endif
-            pair = encode(tile.levels, {tables}, point, column);
+        const float2 pair = encode(tile.levels, {tables}, point, column, group);
         *reinterpret_cast<uint32_t*>(&tile.values[row][column]) = pack(pair.x, pair.y);
     }
 }
@@ -368,7 +360,7 @@ RW_FN void predict_tile(Tile& tile, Stream& stream, const uint16_t* tables, cons
     auto follow = [&](auto group) {
         constexpr int GROUP = decltype(group)::value;
         __syncthreads();
-        encode_tile<GROUP>(tile, tables, reading.step);
+        encode_tile(tile, tables, Tangents{GROUP - 1, reading.step});
         tangent_tile(tile, stream, ENCODED_PADDED, passed);
 #pragma unroll 1
         for (int layer = 1; layer < HIDDEN; ++layer) tangent_tile(tile, stream, PADDED, passed_of(layer));
@@ -427,6 +419,37 @@ RW_FN Sample sample_at(const Draw& draw, uint32_t position) {
     return position < draw.batch ? drawn_sample(draw, position) : no_sample();
 }
 
+// Gradient with respect to the last hidden layer's sums of two neighbouring columns, from the slopes of a row's outputs. `active`: not 0 in the
+// lower and in the upper half if the ReLU passed. Adds the products of `values` with the slopes to `weights`.
+RW_FN float2 head_pair(const float (&slopes)[OUTPUTS], const float (&x)[OUTPUTS], const float (&y)[OUTPUTS], uint32_t values, uint32_t active,
+                       float2 (&weights)[OUTPUTS]) {
+    const float2 pair = unpack(values);
+    float low = 0.0f, high = 0.0f;
+    RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+        const float slope = slopes[output];
+        low = fma_(slope, x[output], low);
+        high = fma_(slope, y[output], high);
+        weights[output].x = fma_(pair.x, slope, weights[output].x);
+        weights[output].y = fma_(pair.y, slope, weights[output].y);
+    }
+    return make_float2(active & 0x0000ffffu ? low : 0.0f, active & 0xffff0000u ? high : 0.0f);
+}
+
+// Adds the gradient of two neighbouring rows of the head.
+RW_FN void add_head_pair(float* head_gradient, int column, const float2 (&weights)[OUTPUTS], float factor) {
+    if constexpr (OUTPUTS == 1) {
+        add_pair(head_gradient, column, factor * weights[0].x, factor * weights[0].y);
+    } else {
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            if (column < WIDTH) atomicAdd(head_gradient + column * OUTPUTS + output, factor * weights[output].x);
+            if (column + 1 < WIDTH) atomicAdd(head_gradient + (column + 1) * OUTPUTS + output, factor * weights[output].y);
+        }
+    }
+}
+
+// Two columns per thread; in narrow layers several threads share the rows.
+constexpr int PAIRS = PADDED / 2, SHARES = PAIRS < THREADS ? THREADS / PAIRS : 1, SHARE = ROWS / SHARES;
+
 // Adds the gradients of the head and of the last hidden layer's biases, and adds the squared errors over outputs and batch to the loss. Replaces
 // the values of the last hidden layer by the gradient with respect to its sums. A sample without targets contributes nothing.
 RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& draw, float* head_gradient, float* bias_gradient, double* loss) {
@@ -472,8 +495,6 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
     if (lane() == 0u) atomicAdd(head_gradient + WIDTH, penalties);
     __syncthreads();
 #endif
-    // Two columns per thread; in narrow layers several threads share the rows.
-    constexpr int PAIRS = PADDED / 2, SHARES = PAIRS < THREADS ? THREADS / PAIRS : 1, SHARE = ROWS / SHARES;
     for (int i = threadIdx.x; i < PAIRS * SHARES; i += THREADS) {
         const int column = 2 * (i % PAIRS), first = i / PAIRS * SHARE;
         float x[OUTPUTS], y[OUTPUTS];
@@ -484,94 +505,172 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
         }
         for (int row = first; row < first + SHARE; ++row) {
             uint32_t& at = *reinterpret_cast<uint32_t*>(&tile.values[row][column]);
-            const uint32_t active = at;
-            const float2 pair = unpack(active);
-            float low = 0.0f, high = 0.0f;
-            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
-                const float slope = tile.slopes[row][output];
-                low = fma_(slope, x[output], low);
-                high = fma_(slope, y[output], high);
-                weights[output].x = fma_(pair.x, slope, weights[output].x);
-                weights[output].y = fma_(pair.y, slope, weights[output].y);
-            }
-            low = active & 0x00007fffu ? low : 0.0f;
-            high = active & 0x7fff0000u ? high : 0.0f;
-            bias.x += low;
-            bias.y += high;
-            at = pack(low, high);
+            const float2 delta = head_pair(tile.slopes[row], x, y, at, at & 0x7fff7fffu, weights);
+            bias.x += delta.x;
+            bias.y += delta.y;
+            at = pack(delta.x, delta.y);
         }
-        if constexpr (OUTPUTS == 1) {
-            add_pair(head_gradient, column, weights[0].x, weights[0].y);
-        } else {
-            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
-                if (column < WIDTH) atomicAdd(head_gradient + column * OUTPUTS + output, weights[output].x);
-                if (column + 1 < WIDTH) atomicAdd(head_gradient + (column + 1) * OUTPUTS + output, weights[output].y);
-            }
-        }
+        add_head_pair(head_gradient, column, weights, 1.0f);
         add_pair(bias_gradient, column, bias.x, bias.y);
     }
     __syncthreads();
 }
 
+#if RW_DERIVATIVES
+// Bits of a pair of a tile's values, of those that `forward_tile` stored: bit 0 for the lower one, bit 16 for the upper one.
+RW_FN uint32_t passed_pair(const uint32_t* passed, int row, int column) {
+    const int inside = column % COLUMNS, below = row % (16 * M);
+    const int thread = row / (16 * M) * 128 + inside / (8 * N) * 32 + below % 8 * 4 + inside % 8 / 2;
+    const uint32_t word = passed[(column / COLUMNS * M + below / 16) * THREADS + thread];
+    return word >> passed_bit(inside % (8 * N) / 8, below % 16 / 8) & 0x00010001u;
+}
+
+// As `head_tile`, for the tangents of samples number `first` on, which have no biases. `passed`: the bits of the last hidden layer. The gradient
+// and the loss get `factor` times those of the tangents; what replaces the tile's values does not have it.
+RW_FN void tangent_head_tile(Tile& tile, const float* __restrict__ head, const Draw& draw, uint32_t first, const Tangents& tangents, float factor,
+                             const uint32_t* passed, float* head_gradient, double* loss) {
+    float outputs[OWN][OUTPUTS], squares = 0.0f;
+    outputs_of(outputs, tile, head, false);
+    const int own = own_row() + min_(int(lane()), OWN - 1);
+    const bool usable = is_usable(tile.samples[own]);
+    const Float4* sample = usable ? drawn_at(draw, first + own) : nullptr;
+    RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+        float found = 0.0f;
+        RW_UNROLL for (int row = 0; row < OWN; ++row) found = int(lane()) == row ? outputs[row][output] : found;
+        const float difference = usable ? tangent_difference(found, tangents.step * load_slope(sample, tangents.along, output)) : 0.0f;
+        if (int(lane()) < OWN) {
+            tile.slopes[own][output] = 2.0f * difference;
+            squares = fma_(difference, difference, squares);
+        }
+    }
+    squares = warp_sum(squares);
+    if (lane() == 0u) atomicAdd(loss, double(factor * squares) / OUTPUTS / draw.batch);
+    __syncthreads();
+    for (int i = threadIdx.x; i < PAIRS * SHARES; i += THREADS) {
+        const int column = 2 * (i % PAIRS), from = i / PAIRS * SHARE;
+        float x[OUTPUTS], y[OUTPUTS];
+        float2 weights[OUTPUTS];
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            x[output] = head_weight(head, column, output), y[output] = head_weight(head, column + 1, output);
+            weights[output] = make_float2(0.0f, 0.0f);
+        }
+        for (int row = from; row < from + SHARE; ++row) {
+            uint32_t& at = *reinterpret_cast<uint32_t*>(&tile.values[row][column]);
+            const float2 delta = head_pair(tile.slopes[row], x, y, at, passed_pair(passed, row, column), weights);
+            at = pack(delta.x, delta.y);
+        }
+        add_head_pair(head_gradient, column, weights, factor);
+    }
+    __syncthreads();
+}
+#endif
+
+#if RW_LEVELS > 0
+// Replaces the gradient with respect to the first layer's sums by that with respect to the encoded points, or to their tangents, in halves, and
+// adds `factor` times it to the tables.
+template <class Group = Values>
+RW_FN void scatter_tile(Tile& tile, Stream& stream, float* __restrict__ table_gradient, float factor = 1.0f, Group group = Group()) {
+    auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
+    multiply_tile<ENCODED_PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int, uint32_t (&pairs)[M][N][2]) {
+        RW_UNROLL for (int m = 0; m < M; ++m) {
+            RW_UNROLL for (int n = 0; n < N; ++n)
+                RW_UNROLL for (int half = 0; half < 2; ++half) pairs[m][n][half] = pack(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+        }
+    });
+    for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
+        const int at = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
+        // A sample without a target would only add zeros.
+        if (!is_usable(tile.samples[at])) continue;
+        float point[DIMS];
+        inputs(point, tile.samples[at].place);
+        const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[at][column]));
+        scatter(tile.levels, point, column, factor * pair.x, factor * pair.y, table_gradient, group);
+    }
+}
+#endif
+
 // First bias of a hidden layer of the flat vector.
 RW_FN constexpr int bias_start(int layer) { return layer_start(layer) + (layer == 0 ? ENCODED : WIDTH) * WIDTH; }
 
+// Groups of rows per sample in training.
+constexpr int TRAINED_GROUPS = RW_DERIVATIVES ? GROUPS : 1;
+// Layers whose ReLU bits training keeps. The last one needs none for the values, whose gradient reads them itself.
+constexpr int PASSED_LAYERS = RW_DERIVATIVES ? HIDDEN : HIDDEN - 1;
+
 // Handles `rows` samples (whole tiles) of a batch from number `first` on. Adds the gradients of the tables (`table_gradient`, padded), of the
 // biases and the head (`layer_gradient`, flat) and the loss. Stores encoded points (rows of ENCODED_PADDED), and values of and gradients with
-// respect to the sums of each hidden layer (rows of PADDED, `held` rows per layer). `passed`: HIDDEN - 1 times PASSED words per block.
+// respect to the sums of each hidden layer (rows of PADDED, `held` rows per layer). `passed`: PASSED_LAYERS times PASSED words per block.
+//
+// If the loss has derivatives, `rows` rows of tangents along each axis follow the rows of the values. Tangents have the length `step`; `factor`,
+// which divides it out and weights their part of the loss, multiplies their gradients in single precision. What is stored does not have it, so
+// that tangents and their gradients are of the order of values in half precision.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
                  const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Draw draw, uint32_t first, uint32_t rows,
                  uint32_t held, uint16_t* __restrict__ encoded, uint16_t* __restrict__ values, uint16_t* __restrict__ deltas, uint32_t* passed,
-                 float* __restrict__ table_gradient, float* __restrict__ layer_gradient, double* __restrict__ loss) {
+                 float* __restrict__ table_gradient, float* __restrict__ layer_gradient, double* __restrict__ loss, [[maybe_unused]] float step,
+                 [[maybe_unused]] float factor) {
     Tile& tile = *reinterpret_cast<Tile*>(memory);
     read_levels(tile.levels, grid);
-    passed += blockIdx.x * size_t((HIDDEN - 1) * PASSED);
+    passed += blockIdx.x * size_t(PASSED_LAYERS * PASSED);
 #if RW_PENALTY
     if (first == 0 && blockIdx.x == 0 && threadIdx.x == 0) atomicAdd(loss, penalty_loss(draw));
 #endif
     Stream stream(slices, tile.stages, ALL_SLICES);
     for (uint32_t row = blockIdx.x * ROWS; row < rows; row += gridDim.x * ROWS) {
-        auto of = [&](uint16_t* all, int layer) { return all + (layer * size_t(held) + row) * PADDED; };
+        auto of = [&](uint16_t* all, int layer, int group) { return all + (layer * size_t(held) + group * size_t(rows) + row) * PADDED; };
         __syncthreads();
         if (threadIdx.x < ROWS) tile.samples[threadIdx.x] = sample_at(draw, first + row + threadIdx.x);
         __syncthreads();
         encode_tile(tile, tables);
         __syncthreads();
         store_tile<ENCODED_PADDED>(tile, encoded + row * size_t(ENCODED_PADDED));
-        forward_tile(tile, stream, ENCODED_PADDED, biases, HIDDEN > 1 ? passed : nullptr);
-        store_tile<PADDED>(tile, of(values, 0));
+        forward_tile(tile, stream, ENCODED_PADDED, biases, PASSED_LAYERS > 0 ? passed : nullptr);
+        store_tile<PADDED>(tile, of(values, 0, 0));
 #pragma unroll 1
         for (int layer = 1; layer < HIDDEN; ++layer) {
-            // The last layer needs no bits: its gradient reads the values.
-            forward_tile(tile, stream, PADDED, biases + layer * PADDED, layer < HIDDEN - 1 ? passed + layer * PASSED : nullptr);
-            store_tile<PADDED>(tile, of(values, layer));
+            forward_tile(tile, stream, PADDED, biases + layer * PADDED, layer < PASSED_LAYERS ? passed + layer * PASSED : nullptr);
+            store_tile<PADDED>(tile, of(values, layer, 0));
         }
         __syncthreads();
         head_tile(tile, head, draw, layer_gradient + layer_start(HIDDEN), layer_gradient + bias_start(HIDDEN - 1), loss);
-        store_tile<PADDED>(tile, of(deltas, HIDDEN - 1));
+        store_tile<PADDED>(tile, of(deltas, HIDDEN - 1, 0));
 #pragma unroll 1
         for (int layer = HIDDEN - 2; layer >= 0; --layer) {
             backward_tile(tile, stream, passed + layer * PASSED, layer_gradient + bias_start(layer));
-            store_tile<PADDED>(tile, of(deltas, layer));
+            store_tile<PADDED>(tile, of(deltas, layer, 0));
         }
 #if RW_LEVELS > 0
-        // Gradient with respect to the encoded points, in halves, which is scattered to the tables.
-        auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
-        multiply_tile<ENCODED_PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int, uint32_t (&pairs)[M][N][2]) {
-            RW_UNROLL for (int m = 0; m < M; ++m) {
-                RW_UNROLL for (int n = 0; n < N; ++n)
-                    RW_UNROLL for (int half = 0; half < 2; ++half) pairs[m][n][half] = pack(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+        scatter_tile(tile, stream, table_gradient);
+#endif
+#if RW_DERIVATIVES
+#pragma unroll 1
+        for (int along = 0; along < SPACE; ++along) {
+            const Tangents tangents = {along, step};
+            const int group = 1 + along;
+            __syncthreads();
+            encode_tile(tile, tables, tangents);
+            __syncthreads();
+            store_tile<ENCODED_PADDED>(tile, encoded + (group * size_t(rows) + row) * ENCODED_PADDED);
+            tangent_tile(tile, stream, ENCODED_PADDED, passed);
+            store_tile<PADDED>(tile, of(values, 0, group));
+#pragma unroll 1
+            for (int layer = 1; layer < HIDDEN; ++layer) {
+                tangent_tile(tile, stream, PADDED, passed + layer * PASSED);
+                store_tile<PADDED>(tile, of(values, layer, group));
             }
-        });
-        for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
-            const int at = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
-            // A sample without a target would only add zeros.
-            if (!is_usable(tile.samples[at])) continue;
-            float point[DIMS];
-            inputs(point, tile.samples[at].place);
-            const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[at][column]));
-            scatter(tile.levels, point, column, pair.x, pair.y, table_gradient);
+            __syncthreads();
+            const uint32_t* last = passed + (HIDDEN - 1) * PASSED;
+            tangent_head_tile(tile, head, draw, first + row, tangents, factor, last, layer_gradient + layer_start(HIDDEN), loss);
+            store_tile<PADDED>(tile, of(deltas, HIDDEN - 1, group));
+#pragma unroll 1
+            for (int layer = HIDDEN - 2; layer >= 0; --layer) {
+                tangent_tile(tile, stream, PADDED, passed + layer * PASSED);
+                store_tile<PADDED>(tile, of(deltas, layer, group));
+            }
+#if RW_LEVELS > 0
+            scatter_tile(tile, stream, table_gradient, factor, tangents);
+#endif
         }
 #endif
     }
@@ -589,11 +688,12 @@ struct PanelColumns {
     static RW_FN void read(uint32_t (&to)[4], const uint16_t* from, int m) { load_transposed(to, from + 16 * m); }
 };
 
-// Adds the weight gradients over `rows` samples: the transposed inputs of a layer times its gradients, as `batched_gradient` stored them. Each
-// block of the grid's y takes `share` samples; each block of its x takes PANEL times COLUMNS weights, layer by layer.
+// Adds the weight gradients over `rows` rows, times `factor` if the loss has derivatives: the transposed inputs of a layer times its gradients, as
+// `batched_gradient` stored them. Each block of the grid's y takes `share` rows; each block of its x takes PANEL times COLUMNS weights, layer by
+// layer.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_products(const uint16_t* __restrict__ encoded, const uint16_t* __restrict__ values, const uint16_t* __restrict__ deltas, uint32_t rows,
-                 uint32_t held, uint32_t share, float* __restrict__ layer_gradient) {
+                 uint32_t held, uint32_t share, float* __restrict__ layer_gradient, [[maybe_unused]] float factor) {
     constexpr int FIRST = (ENCODED + PANEL - 1) / PANEL * PASSES, OTHERS = (WIDTH + PANEL - 1) / PANEL * PASSES;
     Panels* stages = reinterpret_cast<Panels*>(memory);
     const int number = blockIdx.x, layer = number < FIRST ? 0 : 1 + (number - FIRST) / OTHERS;
@@ -632,8 +732,11 @@ batched_products(const uint16_t* __restrict__ encoded, const uint16_t* __restric
         RW_UNROLL for (int n = 0; n < N; ++n) {
             RW_UNROLL for (int half = 0; half < 2; ++half) {
                 const int input = first_input + lane_row(4, m) + 8 * half;
-                if (input < inputs)
-                    add_pair(gradient + input * size_t(WIDTH), first_neuron + lane_column(n), sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+                float x = sums[m][n][2 * half], y = sums[m][n][2 * half + 1];
+#if RW_DERIVATIVES
+                x *= factor, y *= factor;
+#endif
+                if (input < inputs) add_pair(gradient + input * size_t(WIDTH), first_neuron + lane_column(n), x, y);
             }
         }
     }

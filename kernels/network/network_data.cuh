@@ -68,17 +68,19 @@ RW_FN void inputs(float (&point)[DIMS], const float (&unit)[PLACES]) {
     RW_UNROLL for (int k = 0; k < DIMS; ++k) point[k] = unit[axes[k]];
 }
 
-// A sample: unit point and times at their places, standardised targets. Stored in one or two Float4.
+// A sample: unit point and times at their places, standardised targets.
 struct Sample {
     float place[PLACES];
     float target[OUTPUTS];
 };
-constexpr int SAMPLE_FLOAT4S = (PLACES + OUTPUTS + 3) / 4;
-static_assert(SAMPLE_FLOAT4S <= 2, "room");
+// Targets of the derivatives follow, if the loss has them: OUTPUTS along each axis.
+constexpr int SAMPLE_VALUES = PLACES + OUTPUTS, SLOPES = RW_DERIVATIVES ? SPACE * OUTPUTS : 0;
+// Float4s that hold a sample, and those that hold it without derivatives.
+constexpr int SAMPLE_FLOAT4S = (SAMPLE_VALUES + SLOPES + 3) / 4, PLAIN_FLOAT4S = (SAMPLE_VALUES + 3) / 4;
 
 RW_FN Sample load_sample(const Float4* at) {
-    float values[8] = {};
-    RW_UNROLL for (int i = 0; i < SAMPLE_FLOAT4S; ++i) {
+    float values[4 * PLAIN_FLOAT4S];
+    RW_UNROLL for (int i = 0; i < PLAIN_FLOAT4S; ++i) {
         const Float4 four = load(at + i);
         values[4 * i] = four.x, values[4 * i + 1] = four.y, values[4 * i + 2] = four.z, values[4 * i + 3] = four.w;
     }
@@ -88,10 +90,16 @@ RW_FN Sample load_sample(const Float4* at) {
     return sample;
 }
 
-RW_FN void store_sample(Float4* at, const Sample& sample) {
-    float values[8] = {};
+// Target of an output's derivative along an axis, in unit coordinates.
+RW_FN float load_slope(const Float4* at, int along, int output) {
+    return load(reinterpret_cast<const float*>(at) + SAMPLE_VALUES + along * OUTPUTS + output);
+}
+
+RW_FN void store_sample(Float4* at, const Sample& sample, [[maybe_unused]] const float (&slopes)[SPACE][OUTPUTS]) {
+    float values[4 * SAMPLE_FLOAT4S] = {};
     RW_UNROLL for (int k = 0; k < PLACES; ++k) values[k] = sample.place[k];
     RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) values[PLACES + k] = sample.target[k];
+    RW_UNROLL for (int k = 0; k < SLOPES; ++k) values[SAMPLE_VALUES + k] = slopes[k / OUTPUTS][k % OUTPUTS];
     RW_UNROLL for (int i = 0; i < SAMPLE_FLOAT4S; ++i) at[i] = {values[4 * i], values[4 * i + 1], values[4 * i + 2], values[4 * i + 3]};
 }
 
@@ -102,7 +110,73 @@ RW_FN Sample no_sample() {
     return sample;
 }
 
-// Returns true if the sample has targets: either all of them are finite or none is.
+#if RW_DERIVATIVES
+// Targets of the derivatives (see Objective::targets) from a Jacobian in domain coordinates, 9 floats in row-major order.
+RW_FN void slopes_of(float (&slopes)[SPACE][OUTPUTS], const UnitBox& domain, const Reading& reading, const float* jacobian) {
+    const int axes[DIMS] = {RW_AXES};
+    RW_UNROLL for (int along = 0; along < SPACE; ++along) {
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            const double ratio = domain.extent[axes[along]] / domain.extent[axes[output]];
+            const float slope = float(jacobian[3 * axes[output] + axes[along]] * ratio);
+            slopes[along][output] = (slope - (output == along ? 1.0f : 0.0f)) / reading.deviation[output];
+        }
+    }
+}
+
+// Limit on the difference of a tangent from its target, in units of the step. A larger one counts as this: a label that chaos stretches without
+// bound then leaves the range of half precision to the others. NaN stays NaN.
+constexpr float MAX_DIFFERENCE = 2048.0f;
+RW_FN float tangent_difference(float found, float target) {
+    const float difference = found - target;
+    return fabsf(difference) > MAX_DIFFERENCE ? copysignf(MAX_DIFFERENCE, difference) : difference;
+}
+#endif
+
+// Turns traced point number `i` (domain coordinates) and its label into a sample. From a log-stretch the target is its difference to `base`,
+// scaled; from an arrival (domain coordinates, 3 floats each) it is the scaled displacement (see Objective::targets), and from a Jacobian (domain
+// coordinates, 9 floats each; read if the loss has derivatives, null: NaN) the displacement's derivatives. One point in 2^held_back gets no target,
+// since the host may keep it for validation; with 0 all points get one.
+RW_FN void write_sample(const UnitBox& domain, const Reading& reading, const float* __restrict__ points, const float* __restrict__ labels,
+                        [[maybe_unused]] const float* __restrict__ jacobians, uint32_t i, uint32_t held_back, Float4* __restrict__ samples) {
+    const float point[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
+    float unit[3];
+    to_unit(domain, point, unit);
+    Sample sample;
+    read_point(reading, points, i, sample.place);
+    RW_UNROLL for (int k = 0; k < 3; ++k) sample.place[k] = unit[k];
+#if RW_FLOW_MAP
+    const int axes[DIMS] = {RW_AXES};
+    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) {
+        const int axis = axes[k];
+        const float arrival = float((double(labels[3 * size_t(i) + axis]) - domain.min[axis]) / domain.extent[axis]);
+        sample.target[k] = (arrival - unit[axis] - reading.mean[k]) / reading.deviation[k];
+    }
+#else
+    if (reading.published) {
+        const float y = labels[i] / reading.tau;
+        sample.target[0] = copysignf(log1pf(fabsf(y)), y);
+    } else {
+        const float below = reading.base.values ? look_up_base(reading, sample.place) : 0.0f;
+        sample.target[0] = (labels[i] - below - reading.mean[0]) / reading.deviation[0];
+    }
+#endif
+    float all = point[0] + point[1] + point[2], slopes[SPACE][OUTPUTS] = {};
+    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) all += sample.target[k];
+#if RW_DERIVATIVES
+    if (jacobians) slopes_of(slopes, domain, reading, jacobians + 9 * size_t(i));
+    else all = not_a_number();
+    // Each alone: the sum of finite derivatives may overflow.
+    RW_UNROLL for (int k = 0; k < SLOPES; ++k) all = is_finite(slopes[k / OUTPUTS][k % OUTPUTS]) ? all : not_a_number();
+#endif
+    // A point that is not finite gets no target.
+    if (!is_finite(all) || (held_back && keeps_label(point, held_back))) {
+        RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) sample.target[k] = not_a_number();
+    }
+    place_times(reading, sample.place);
+    store_sample(samples + i * size_t(SAMPLE_FLOAT4S), sample, slopes);
+}
+
+// Returns true if the sample has targets: either all of them, derivatives included, are finite or none is.
 RW_FN bool is_usable(const Sample& sample) { return is_finite(sample.target[0]); }
 
 // Sum of prediction minus label over the usable samples of a batch, in linear scale, and number of these samples.
@@ -138,11 +212,13 @@ RW_FN uint32_t drawn(const Draw& draw, uint32_t position) {
     return draw.hold_out && index % draw.hold_out == 0u ? (index + 1u) % draw.count : index;
 }
 
-RW_FN Sample drawn_sample(const Draw& draw, uint32_t position) {
+RW_FN const Float4* drawn_at(const Draw& draw, uint32_t position) {
     const uint32_t number = drawn(draw, position);
     const Float4* from = number < draw.first ? draw.samples : draw.more;
-    return load_sample(from + (number < draw.first ? number : number - draw.first) * size_t(SAMPLE_FLOAT4S));
+    return from + (number < draw.first ? number : number - draw.first) * size_t(SAMPLE_FLOAT4S);
 }
+
+RW_FN Sample drawn_sample(const Draw& draw, uint32_t position) { return load_sample(drawn_at(draw, position)); }
 
 // Difference of the means of a batch.
 RW_FN double mean_difference(const Draw& draw) { return draw.means->usable > 0.0 ? draw.means->difference / draw.means->usable : 0.0; }

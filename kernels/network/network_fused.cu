@@ -36,8 +36,9 @@ network_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ 
         hidden_forward(encoded[0], hidden, weights);
         float tangents[OUTPUTS][SPACE];
         RW_UNROLL for (int along = 0; along < SPACE; ++along) {
+            Rows<WIDTH_BLOCKS> passed[HIDDEN];
             float outputs[4];
-            tangent_forward(outputs, encoded[1 + along], hidden, weights);
+            tangent_forward(outputs, encoded[1 + along], passed, hidden, weights);
             RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
                 const float first = output_of(outputs, 0, output), second = output_of(outputs, 1, output);
                 tangents[output][along] = q ? second : first;
@@ -85,8 +86,8 @@ template <int IN, int OUT> struct Products {
         }
     }
 
-    // Adds the sums to the flat gradient of a layer.
-    RW_FN void flush(float* layer, int inputs, int outputs) const {
+    // Adds `factor` times the sums to the flat gradient of a layer, biases included if `biased`.
+    RW_FN void flush(float* layer, int inputs, int outputs, float factor, bool biased) const {
         const int warp = threadIdx.x / 32u, g = lane() >> 2, q = lane() & 3;
         RW_UNROLL for (int i = 0; i < OWN; ++i) {
             const int t = warp + WARPS * i, n = t % OUT, m = t / OUT;
@@ -94,7 +95,8 @@ template <int IN, int OUT> struct Products {
             RW_UNROLL for (int k = 0; k < 4; ++k) {
                 const int in = 16 * m + g + 8 * (k >> 1), out = 8 * n + 2 * q + (k & 1);
                 if (out >= outputs) continue;
-                if (m == IN ? in == 16 * IN : in < inputs) atomicAdd(layer + (m == IN ? inputs : in) * outputs + out, tile[i][k]);
+                if (m == IN ? biased && in == 16 * IN : in < inputs)
+                    atomicAdd(layer + (m == IN ? inputs : in) * outputs + out, factor * tile[i][k]);
             }
         }
     }
@@ -119,6 +121,40 @@ struct alignas(16) Workspace {
 // Shared memory of the launches.
 static_assert(sizeof(Weights) == RW_WEIGHTS_BYTES && sizeof(Workspace) == RW_WORKSPACE_BYTES, "layout");
 
+// Weight gradients of all layers.
+struct Gradients {
+    Products<ENCODED_BLOCKS, 2 * WIDTH_BLOCKS> first;
+    Products<WIDTH_BLOCKS, 2 * WIDTH_BLOCKS> middle[HIDDEN > 1 ? HIDDEN - 1 : 1];
+    Products<WIDTH_BLOCKS, 1> last;
+
+    RW_FN void clear() {
+        first.clear();
+        last.clear();
+        RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].clear();
+    }
+
+    // Adds `factor` times the sums to the flat gradient, biases included if `biased`.
+    RW_FN void flush(float* layers, float factor, bool biased) const {
+        first.flush(layers, ENCODED, WIDTH, factor, biased);
+        RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer)
+            middle[layer - 1].flush(layers + layer_start(layer), WIDTH, WIDTH, factor, biased);
+        last.flush(layers + layer_start(HIDDEN), WIDTH, OUTPUTS, factor, biased);
+    }
+};
+
+// Adds `sum` of all threads, divided by outputs and batch, to the loss, and `more` once per launch.
+RW_FN void add_loss(double* loss, float sum, uint32_t batch, double more) {
+    __shared__ float sums[WARPS];
+    sum = warp_sum(sum);
+    if (lane() == 0u) sums[threadIdx.x / 32u] = sum;
+    __syncthreads();
+    if (threadIdx.x == 0) {
+        double all = 0.0;
+        for (int warp = 0; warp < WARPS; ++warp) all += sums[warp];
+        atomicAdd(loss, all / OUTPUTS / batch + (blockIdx.x == 0 ? more : 0.0));
+    }
+}
+
 // Adds the gradient of the squared errors of each sample of the batch. The loss is their mean over outputs and batch; the optimizer divides the
 // gradient by both. A sample without targets contributes nothing.
 extern "C" __global__ void __launch_bounds__(THREADS, TOGETHER)
@@ -126,16 +162,11 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
                  float* __restrict__ table_gradient, float* __restrict__ layer_gradient, double* __restrict__ loss) {
     Workspace& work = *reinterpret_cast<Workspace*>(shared);
     __shared__ Level levels[LEVELS > 0 ? LEVELS : 1];
-    __shared__ float losses[WARPS];
     read_levels(levels, grid);
     read_layers(work.weights, layers);
     const uint32_t tiles = (draw.batch + ROWS - 1u) / ROWS, g = lane() >> 2, q = lane() & 3u;
-    Products<ENCODED_BLOCKS, 2 * WIDTH_BLOCKS> first;
-    Products<WIDTH_BLOCKS, 2 * WIDTH_BLOCKS> middle[HIDDEN > 1 ? HIDDEN - 1 : 1];
-    Products<WIDTH_BLOCKS, 1> last;
-    first.clear();
-    last.clear();
-    RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].clear();
+    Gradients gradients;
+    gradients.clear();
 #if RW_PENALTY
     const float penalty = penalty_slope(draw);
 #endif
@@ -175,7 +206,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
             *reinterpret_cast<uint32_t*>(&work.delta[16 * (threadIdx.x / 32u) + g + 8 * row][2 * q]) = pair;
         }
         __syncthreads();
-        last.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+        gradients.last.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
         Rows<WIDTH_BLOCKS> delta;
         {
             Sums<2 * WIDTH_BLOCKS> sums;
@@ -195,7 +226,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
             store(&work.in[0][0], IN_STRIDE, hidden[layer - 1]);
             store(&work.delta[0][0], STRIDE, delta);
             __syncthreads();
-            middle[layer - 1].add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+            gradients.middle[layer - 1].add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
             Sums<2 * WIDTH_BLOCKS> sums;
             backward(sums, delta, work.weights.hidden[layer - 1]);
             relu_mask(delta, hidden[layer - 1], sums);
@@ -205,7 +236,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         store(&work.in[0][0], IN_STRIDE, encoded);
         store(&work.delta[0][0], STRIDE, delta);
         __syncthreads();
-        first.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+        gradients.first.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
 #if RW_LEVELS > 0
         Sums<2 * ENCODED_BLOCKS> sums;
         backward(sums, delta, work.weights.first);
@@ -219,19 +250,127 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
 #endif
         __syncthreads();
     }
-    first.flush(layer_gradient, ENCODED, WIDTH);
-    RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].flush(layer_gradient + layer_start(layer), WIDTH, WIDTH);
-    last.flush(layer_gradient + layer_start(HIDDEN), WIDTH, OUTPUTS);
-    squares = warp_sum(squares);
-    if (lane() == 0u) losses[threadIdx.x / 32u] = squares;
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        double sum = 0.0;
-        for (int warp = 0; warp < WARPS; ++warp) sum += losses[warp];
-        sum = sum / OUTPUTS / draw.batch;
+    gradients.flush(layer_gradient, 1.0f, true);
+    double more = 0.0;
 #if RW_PENALTY
-        if (blockIdx.x == 0) sum += penalty_loss(draw);
+    more = penalty_loss(draw);
 #endif
-        atomicAdd(loss, sum);
-    }
+    add_loss(loss, squares, draw.batch, more);
 }
+
+#if RW_DERIVATIVES
+// Backpropagates `slopes`, the gradient with respect to a tangent's outputs in all four lanes of a sample, through the layers as `network_gradient`
+// does (which does not call this: the compiler would spill other registers there): adds to their gradients, and calls `give(sums)` with the
+// gradient with respect to the encoded tangents, if there are tables. `rows`: tangents of the hidden layers; `passed`: the ReLU's masks. The whole
+// block must call it; ends with a barrier.
+template <class Give>
+RW_FN void backpropagate(Workspace& work, Gradients& gradients, const float (&slopes)[2][OUTPUTS], const Rows<ENCODED_BLOCKS>& encoded,
+                         const Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Passed (&passed)[HIDDEN], [[maybe_unused]] Give give) {
+    const uint32_t g = lane() >> 2, q = lane() & 3u;
+    // The head.
+    store(&work.in[0][0], IN_STRIDE, rows[HIDDEN - 1]);
+    RW_UNROLL for (int row = 0; row < 2; ++row) {
+        uint32_t pair = q == 0u ? pack(slopes[row][0], OUTPUTS > 1 ? slopes[row][OUTPUTS > 1] : 0.0f) : 0u;
+        if (OUTPUTS > 2 && q == 1u) pair = pack(slopes[row][OUTPUTS - 1], 0.0f);
+        *reinterpret_cast<uint32_t*>(&work.delta[16 * (threadIdx.x / 32u) + g + 8 * row][2 * q]) = pair;
+    }
+    __syncthreads();
+    gradients.last.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+    Rows<WIDTH_BLOCKS> delta;
+    {
+        Sums<2 * WIDTH_BLOCKS> sums;
+        RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
+            RW_UNROLL for (int k = 0; k < 4; ++k) {
+                const uint16_t(&head)[HEAD_STRIDE] = work.weights.head[8 * n + 2 * q + (k & 1)];
+                float sum = slopes[k >> 1][0] * from_half(head[0]);
+                RW_UNROLL for (int output = 1; output < OUTPUTS; ++output) sum = fma_(slopes[k >> 1][output], from_half(head[output]), sum);
+                sums.block[n][k] = sum;
+            }
+        }
+        relu_mask(delta, passed[HIDDEN - 1], sums);
+    }
+    // The hidden layers, last to second.
+    RW_UNROLL for (int layer = HIDDEN - 1; layer > 0; --layer) {
+        __syncthreads();
+        store(&work.in[0][0], IN_STRIDE, rows[layer - 1]);
+        store(&work.delta[0][0], STRIDE, delta);
+        __syncthreads();
+        gradients.middle[layer - 1].add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+        Sums<2 * WIDTH_BLOCKS> sums;
+        backward(sums, delta, work.weights.hidden[layer - 1]);
+        relu_mask(delta, passed[layer - 1], sums);
+    }
+    // The first layer, and the tables below it.
+    __syncthreads();
+    store(&work.in[0][0], IN_STRIDE, encoded);
+    store(&work.delta[0][0], STRIDE, delta);
+    __syncthreads();
+    gradients.first.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
+#if RW_LEVELS > 0
+    Sums<2 * ENCODED_BLOCKS> sums;
+    backward(sums, delta, work.weights.first);
+    give(sums);
+#endif
+    __syncthreads();
+}
+
+// Adds the gradient of the squared errors of the network's derivatives along each axis, times `factor`. Tangents have the length `step`, which
+// `factor` divides out in single precision, so that tangents and their gradients are of the order of values in half precision.
+extern "C" __global__ void __launch_bounds__(THREADS, TOGETHER)
+network_tangent_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const float* __restrict__ layers, const Draw draw,
+                         float step, float factor, float* __restrict__ table_gradient, float* __restrict__ layer_gradient,
+                         double* __restrict__ loss) {
+    Workspace& work = *reinterpret_cast<Workspace*>(shared);
+    __shared__ Level levels[LEVELS > 0 ? LEVELS : 1];
+    read_levels(levels, grid);
+    read_layers(work.weights, layers);
+    const uint32_t tiles = (draw.batch + ROWS - 1u) / ROWS, g = lane() >> 2, q = lane() & 3u;
+    Gradients gradients;
+    gradients.clear();
+    float squares = 0.0f;
+    for (uint32_t tile = blockIdx.x; tile < tiles; tile += gridDim.x) {
+        float points[2][DIMS];
+        // Null: no target.
+        const Float4* samples[2];
+        RW_UNROLL for (int row = 0; row < 2; ++row) {
+            const uint32_t position = tile * ROWS + 16u * (threadIdx.x / 32u) + g + 8u * row;
+            samples[row] = position < draw.batch ? drawn_at(draw, position) : nullptr;
+            const Sample sample = samples[row] ? load_sample(samples[row]) : no_sample();
+            if (!is_usable(sample)) samples[row] = nullptr;
+            inputs(points[row], sample.place);
+        }
+        Rows<ENCODED_BLOCKS> encoded;
+        Rows<WIDTH_BLOCKS> rows[HIDDEN];
+        encode_rows(encoded, levels, {tables}, points);
+        hidden_forward(encoded, rows, work.weights);
+        Passed passed[HIDDEN];
+        RW_UNROLL for (int layer = 0; layer < HIDDEN; ++layer) passed[layer] = Passed(rows[layer]);
+#pragma unroll 1
+        for (int along = 0; along < SPACE; ++along) {
+            const Tangents tangents = {along, step};
+            encode_rows(encoded, levels, {tables}, points, tangents);
+            float outputs[4], slopes[2][OUTPUTS];
+            tangent_forward(outputs, encoded, rows, passed, work.weights);
+            RW_UNROLL for (int row = 0; row < 2; ++row) {
+                RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+                    const float found = output_of(outputs, row, output);
+                    const float difference = samples[row] ? tangent_difference(found, step * load_slope(samples[row], along, output)) : 0.0f;
+                    if (q == 0u) squares = fma_(difference, difference, squares);
+                    slopes[row][output] = 2.0f * difference;
+                }
+            }
+            backpropagate(work, gradients, slopes, encoded, rows, passed, [&](const Sums<2 * ENCODED_BLOCKS>& sums) {
+                RW_UNROLL for (int n = 0; n < 2 * ENCODED_BLOCKS; ++n) {
+                    RW_UNROLL for (int row = 0; row < 2; ++row) {
+                        const float x = factor * sums.block[n][2 * row], y = factor * sums.block[n][2 * row + 1];
+                        if (samples[row]) scatter(levels, points[row], 8 * n + 2 * int(q), x, y, table_gradient, tangents);
+                    }
+                }
+            });
+        }
+    }
+    // Biases do not move a tangent.
+    gradients.flush(layer_gradient, factor, false);
+    add_loss(loss, factor * squares, draw.batch, 0.0);
+}
+#endif

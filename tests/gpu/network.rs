@@ -394,8 +394,8 @@ fn held_out_and_broken_samples_are_not_learned_from() {
 #[test]
 #[ignore = "needs a GPU"]
 fn what_the_kernels_do_not_take_is_refused() {
-    let settings = NetworkSettings { log2_table: Some(10), target: Target::FlowMap, jacobian_weight: 0.3, ..NetworkSettings::default() };
-    let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
+    let settings = NetworkSettings { log2_table: Some(10), target: Target::FlowMap, ..NetworkSettings::default() };
+    let shape = Architecture::new(&settings, &[1], [1.0; 3]).unwrap();
     let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
     let refused = DeviceTraining::new(&gpu(), &Model::new(shape, 1, false), &objective).unwrap_err();
     assert!(matches!(refused, DeviceError::Unsupported { .. }), "{refused}");
@@ -485,7 +485,7 @@ fn what_is_kept_comes_back() {
 #[ignore = "needs a GPU"]
 fn a_ring_is_followed_wherever_it_writes() {
     let (model, objective, _) = prepare(&cases()[1]);
-    assert!(DeviceTraining::takes(&gpu(), &model.shape, &objective));
+    assert!(DeviceNetwork::takes(&gpu(), &model.shape));
     let mut device = CudaTraining::new(&gpu(), HostNetwork::fresh(model.clone()), true);
     device.begin(&objective, 1 << 16, 1 << 10).unwrap();
     let mut buffer = ReplayBuffer::new(1000);

@@ -92,6 +92,14 @@ fn gradients_of_flow_maps_and_further_inputs() {
     cases().iter().for_each(check_gradients);
 }
 
+#[test]
+#[ignore = "needs a GPU"]
+fn gradients_with_derivatives_in_the_loss() {
+    for case in cases().into_iter().filter(|case| case.settings.target == Target::FlowMap) {
+        check_gradients(&Case { settings: NetworkSettings { jacobian_weight: 0.3, ..case.settings }, ..case });
+    }
+}
+
 /// A small run whose frames are answered by a network that learns, in space.
 fn turbulence() -> String {
     scene::gated_turbulence(
@@ -138,8 +146,9 @@ fn frames_of_a_slide(frames: &[Frame]) -> usize {
 fn runs_learn_on_the_device_what_the_cpu_learns() {
     let gpu = device(GpuSettings::default());
     let (turbulence, gyre) = (turbulence(), gyre());
-    let runs: [(&str, &str, &[&str]); 6] = [
+    let runs: [(&str, &str, &[&str]); 7] = [
         ("flow map in space", &turbulence, &["network.target=\"flow_map\""]),
+        ("flow map and derivatives in space", &turbulence, &["network.target=\"flow_map\"", "network.jacobian_weight=1e-4"]),
         ("flow map in the plane", &gyre, &["network.target=\"flow_map\""]),
         ("flow map in the plane and start", &gyre, &["network.target=\"flow_map\"", "network.inputs=[\"start\"]"]),
         ("space and start", &turbulence, &["network.inputs=[\"start\"]", "time.slides=2"]),

@@ -11,7 +11,9 @@ use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceNetwork, Tuning, is_fused};
 use ridgewatch::field::UnitPoint;
-use ridgewatch::surrogate::network::{Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, row};
+use ridgewatch::surrogate::network::{
+    Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, Target, row,
+};
 use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, Samples};
 use std::ops::Range;
 
@@ -145,6 +147,65 @@ fn training_learns_of_the_duration_what_the_cpu_learns() {
     learns_what_the_cpu_learns("x, z and duration", &[0, 2], Some(Input::Duration));
 }
 
+/// Of a flow map with its derivatives in the loss, by kernels that keep samples in registers and by those that take tiles.
+#[test]
+#[ignore = "needs a GPU"]
+fn training_learns_of_derivatives_what_the_cpu_learns() {
+    let usual = NetworkSettings {
+        levels: Some(8),
+        features: 2,
+        log2_table: Some(15),
+        growth: Some(1.5),
+        target: Target::FlowMap,
+        jacobian_weight: 0.01,
+        ..NetworkSettings::default()
+    };
+    let cases = [
+        ("plane", usual.clone(), &[0, 1][..]),
+        ("space", usual.clone(), &[0, 1, 2]),
+        ("space, 256 wide", NetworkSettings { width: 256, ..usual }, &[0, 1, 2]),
+    ];
+    for (name, settings, axes) in cases {
+        let extent = [2.0, 1.0, 1.5];
+        let shape = Architecture::new(&settings, axes, extent).unwrap();
+        let samples = labels(1 << 15, 7);
+        let mut objective = Objective::new(&settings, &shape, extent, 1.0);
+        objective.standardise(&shape, &samples, None);
+        let mut model = Model::new(shape, 9, false);
+        let mut device = training(&model, &objective);
+        let pool = device.upload(&samples, None).unwrap();
+        let (count, all) = (4096, 150);
+        let steps = drawn_steps(count, all);
+        let found = device.train_steps(&pool, None, &steps).unwrap();
+        let mut average = Average { tables: model.tables(), layers: model.layers() };
+        let mut expected = Vec::new();
+        Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
+            expected.extend(loss);
+            steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
+        });
+        let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;
+        let (ours, theirs) = (mean(&found), mean(&expected));
+        measured!("{name}: losses of {all} steps with derivatives: GPU {:.2e} to {ours:.3e}, CPU to {theirs:.3e}", found[0]);
+        // As without derivatives.
+        assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "{name}: first losses {} and {}", found[0], expected[0]);
+        assert!((ours / theirs - 1.0).abs() < 0.15, "{name}: last losses {ours} and {theirs}");
+        assert!(ours < 0.5 * found[0], "{name}: it learns: {} to {ours}", found[0]);
+    }
+}
+
+/// Steps on batches of `count` samples, of which some move the mean of the parameters.
+fn drawn_steps(count: usize, all: u64) -> Vec<PlannedStep> {
+    let share = |number: u64| if number % 8 == 7 { 0.5 } else { 0.0 };
+    let planned = |i: u64| PlannedStep {
+        drawn: Some((21, i * count as u64)),
+        hold_out: true,
+        average_share: share(i),
+        lazy: true,
+        ..step(count, 1e-2)
+    };
+    (0..all).map(planned).collect()
+}
+
 /// A function of the inputs, whichever they are: who does not see one of them cannot learn it.
 fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let inputs = time.into_iter().collect();
@@ -166,16 +227,7 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let (mut model, count, all) = (Model::new(shape.clone(), 9, false), 4096, 150);
     let mut device = training(&model, &objective);
     let pool = device.upload(&samples, None).unwrap();
-    let share = |number: u64| if number % 8 == 7 { 0.5 } else { 0.0 };
-    let steps: Vec<PlannedStep> = (0..all)
-        .map(|i| PlannedStep {
-            drawn: Some((21, i * count as u64)),
-            hold_out: true,
-            average_share: share(i),
-            lazy: true,
-            ..step(count, 1e-2)
-        })
-        .collect();
+    let steps = drawn_steps(count, all);
     let found = device.train_steps(&pool, None, &steps).unwrap();
     let mut average = Average { tables: model.tables(), layers: model.layers() };
     let mut expected = Vec::new();

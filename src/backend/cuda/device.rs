@@ -14,7 +14,7 @@ use ridgewatch_field::UnitPoint;
 use ridgewatch_flow::{FlowMap, VelocitySource};
 use ridgewatch_render::Renderer;
 use ridgewatch_source::Listener;
-use ridgewatch_surrogate::network::{Architecture, NetworkSettings, Objective};
+use ridgewatch_surrogate::network::{Architecture, Objective};
 use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostNetwork, HostSurrogate, Hybrid, Kind, Learned, NetworkFrom, Predict,
     ReplayBuffer, build, fresh_stamp,
@@ -96,18 +96,15 @@ impl Cuda {
             let axes: Vec<usize> = (0..domain.dimensions.clamp(1, 3)).collect();
             let shape = Architecture::new(network, &axes, domain.lengths())?;
             let objective = Objective::new(network, &shape, domain.extent(), 1.0);
-            if !DeviceNetwork::takes(&self.gpu, &shape) || objective.derivatives() {
-                // Only the CPU's router provides labels with Jacobians.
+            if !DeviceNetwork::takes(&self.gpu, &shape) {
                 self.placement = Placement::TRACING_ONLY;
-                self.warnings.push(unsupported(network));
-            } else if !DeviceTraining::takes(&self.gpu, &shape, &objective) {
-                self.placement.training = Place::Host;
-                self.warnings.push(unsupported(network));
+                let what = "the network is trained on the CPU: the GPU does not support layers that its shared memory does not hold";
+                self.warnings.push(what.into());
             }
             let parameters = shape.parameters() as u64 * size_of::<f32>() as u64;
             needs.network = parameters;
             if self.placement.training == Place::Device {
-                needs.training = DeviceTraining::bytes(&shape, request.replay_buffer);
+                needs.training = DeviceTraining::bytes(&shape, &objective, request.replay_buffer);
             }
         }
         let why;
@@ -115,12 +112,6 @@ impl Cuda {
         self.warnings.extend(why);
         Ok(())
     }
-}
-
-fn unsupported(network: &NetworkSettings) -> String {
-    let what =
-        if network.jacobian_weight > 0.0 { "network.jacobian_weight above 0" } else { "layers that its shared memory does not hold" };
-    format!("the network is trained on the CPU: the GPU does not support {what}")
 }
 
 impl Backend for Cuda {
@@ -175,7 +166,7 @@ impl Backend for Cuda {
             Some(CudaFrozen::Resident(frozen)) => Some(frozen),
             Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer, &mut picture.host),
         };
-        if self.placement.frames == Place::Host || job.routing.extras.jacobian || job.is_map {
+        if self.placement.frames == Place::Host || job.is_map {
             return self.render_on_cpu(job, renderer, &mut picture.host);
         }
         self.frames()?.render(job, resident, renderer, picture.numbers)
@@ -187,9 +178,8 @@ impl Backend for Cuda {
         tracer: &CudaTracer,
         surrogate: Option<&CudaFrozen>,
     ) -> Result<AuditFindings, DeviceError> {
-        let jacobian = request.samples.is_some_and(|extras| extras.jacobian);
         match surrogate {
-            Some(CudaFrozen::Resident(frozen)) if !jacobian => self.frames()?.audit(request, tracer, frozen),
+            Some(CudaFrozen::Resident(frozen)) => self.frames()?.audit(request, tracer, frozen),
             surrogate => audit::audit(request, tracer, surrogate.map(|surrogate| surrogate as &dyn Predict)),
         }
     }

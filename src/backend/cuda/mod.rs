@@ -18,7 +18,8 @@ pub use device::{Cuda, CudaFrozen, CudaSurrogate};
 pub use driver::{Budget, Buffer, FoundDevice, Gpu, GpuSettings, compile, driver_error, launch, nvrtc_version, probe, threads};
 pub use layout::Outputs;
 pub use network::{
-    CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
+    CudaTable, CudaTraining, DeviceLabels, DeviceNetwork, DeviceSamples, DeviceTraining, LossTerms, NetworkAbove, OnGpu, Tiling, is_fused,
+    network_defines,
 };
 pub use rendering::{
     Audits, CombineInput, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DeviceNodes, DevicePredict,

@@ -3,9 +3,11 @@
 
 use crate::cuda::driver::Resident;
 use crate::cuda::network::layout::{DrawArgument, GridArgument, ReadingArgument};
+use crate::cuda::network::network::{LossTerms, TangentTerm};
 use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_surrogate::network::{Architecture, Target};
+use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// `DEPTH`, `THREADS`, `PANEL` and `SKEW` of `network_batched.cu`.
@@ -19,7 +21,7 @@ const MAX_PASS_WIDTH: usize = 256;
 const TILINGS: [(usize, usize); 3] = [(128, 4), (64, 4), (32, 3)];
 /// Maximum number of values of a tile whose sums a block's registers hold.
 const MAX_TILE_VALUES: usize = 1 << 16;
-/// Maximum number of samples in memory during training, and of values and of gradients of all their layers.
+/// Maximum number of samples in memory during training, and of values and of gradients of all their layers, tangents included.
 const MAX_TRAINING_ROWS: usize = 1 << 16;
 const MAX_TRAINING_VALUES: usize = 1 << 30;
 
@@ -108,6 +110,8 @@ pub(super) struct Batched {
     head: usize,
     tables: bool,
     flow_map: bool,
+    /// Groups of rows per sample in training: values, and tangents along each axis if the loss has derivatives.
+    groups: usize,
     round: CudaFunction,
     predict: Resident,
     gradient: Resident,
@@ -139,7 +143,7 @@ fn get_or_try_insert<T>(held: &mut Option<T>, create: impl FnOnce() -> Result<T,
     })
 }
 
-/// Results of the gradient kernel for `rows` samples.
+/// Results of the gradient kernel for `rows` rows of values and tangents.
 #[derive(Debug)]
 struct Training {
     rows: usize,
@@ -159,12 +163,12 @@ pub(super) struct GradientTo {
 }
 
 impl Batched {
-    /// Compiles the kernels. `defines`: macros of all networks.
+    /// Compiles the kernels. `defines`: macros of all networks for a loss of these terms.
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         shape: &Architecture,
         grid: GridArgument,
-        defines: &[String],
+        (defines, terms): (&[String], LossTerms),
         tiling: Tiling,
     ) -> Result<Self, DeviceError> {
         let defines: Vec<String> = defines.iter().cloned().chain(tiling.defines()).collect();
@@ -180,6 +184,7 @@ impl Batched {
             head: head.weights,
             tables: !shape.levels.is_empty(),
             flow_map: shape.target == Target::FlowMap,
+            groups: if terms.derivatives { 1 + shape.dimensions() } else { 1 },
             round: kernel("batched_slices")?,
             predict: resident("batched_predict", tiling.tile_bytes)?,
             gradient: resident("batched_gradient", tiling.tile_bytes)?,
@@ -255,50 +260,75 @@ impl Batched {
         unsafe { launch(&mut call, self.predict.config(count.div_ceil(self.tiling.rows))) }
     }
 
-    /// Adds the gradient and the loss of a batch.
+    /// Adds the gradient and the loss of a batch. `term`: tangents of a loss with derivatives.
     ///
     /// # Safety
     /// Device addresses as for [`Self::predict`] and in [`GradientTo`]; the samples of `draw` are there.
-    pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
+    pub(super) unsafe fn gradient(
+        &self,
+        halves: u64,
+        layers: u64,
+        draw: &DrawArgument,
+        term: Option<TangentTerm>,
+        to: GradientTo,
+    ) -> Result<(), DeviceError> {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
         let [_, all] = self.tiling.slices(self.hidden, self.tables);
         let (rounded, training) = self.for_gradients(&mut memory)?;
         let (slices, biases) = self.round(rounded, layers, all)?;
-        let Training { rows: capacity, encoded, values, deltas, passed } = training;
-        let (encoded, values, deltas, passed) = (encoded.address(), values.address(), deltas.address(), passed.address());
-        let (head, held) = (layers + 4 * self.head as u64, *capacity as u32);
-        for first in (0..draw.batch as usize).step_by(*capacity) {
-            let rows = (draw.batch as usize - first).min(*capacity).next_multiple_of(self.tiling.rows);
+        let (encoded, values, deltas) = (training.encoded.address(), training.values.address(), training.deltas.address());
+        let (head, held, passed) = (layers + 4 * self.head as u64, training.rows as u32, training.passed.address());
+        let TangentTerm { step, factor } = term.unwrap_or(TangentTerm { step: 1.0, factor: 0.0 });
+        let most = training.rows / self.groups / self.tiling.rows * self.tiling.rows;
+        for first in (0..draw.batch as usize).step_by(most) {
+            let rows = (draw.batch as usize - first).min(most).next_multiple_of(self.tiling.rows);
             let (n, first) = (rows as u32, first as u32);
             let mut call = self.gpu.work().launch_builder(&self.gradient.function);
             call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(draw).arg(&first).arg(&n).arg(&held);
             call.arg(&encoded).arg(&values).arg(&deltas).arg(&passed).arg(&to.tables).arg(&to.layers).arg(&to.loss);
-            // SAFETY: the arguments of `batched_gradient`; the memory holds `rows` rows.
+            call.arg(&step).arg(&factor);
+            // SAFETY: the arguments of `batched_gradient`; the memory holds `rows` rows of each group.
             unsafe { launch(&mut call, self.gradient.config(rows / self.tiling.rows)) }?;
-
-            let panels = |inputs: usize| inputs.div_ceil(PANEL) * self.tiling.passes;
-            let tiles = panels(self.inputs) + (self.hidden - 1) * panels(self.neurons);
-            // Four rounds of blocks keep most multiprocessors busy in the last one; each block has at least eight steps.
-            let shares = (4 * self.products.blocks as usize / tiles).clamp(1, (rows / (8 * DEPTH)).max(1));
-            let share = rows.div_ceil(shares).next_multiple_of(DEPTH) as u32;
-            let config = LaunchConfig { grid_dim: (tiles as u32, shares as u32, 1), ..self.products.config(1) };
-            let mut call = self.gpu.work().launch_builder(&self.products.function);
-            call.arg(&encoded).arg(&values).arg(&deltas).arg(&n).arg(&held).arg(&share).arg(&to.layers);
-            // SAFETY: the arguments of `batched_products`, with one block per share of a panel.
-            unsafe { launch(&mut call, config) }?;
+            // SAFETY: the kernel above wrote these rows.
+            unsafe { self.add_products(training, 0..rows, 1.0, to.layers) }?;
+            if self.groups > 1 {
+                // SAFETY: as above.
+                unsafe { self.add_products(training, rows..self.groups * rows, factor, to.layers) }?;
+            }
         }
         Ok(())
     }
 
+    /// Adds `factor` times the weight gradients over a range of rows to the flat vector at `to`.
+    ///
+    /// # Safety
+    /// `batched_gradient` has written these rows, and the flat vector is of this architecture.
+    unsafe fn add_products(&self, training: &Training, range: Range<usize>, factor: f32, to: u64) -> Result<(), DeviceError> {
+        let (rows, width) = (range.len(), self.tiling.width());
+        let panels = |inputs: usize| inputs.div_ceil(PANEL) * self.tiling.passes;
+        let tiles = panels(self.inputs) + (self.hidden - 1) * panels(self.neurons);
+        // Four rounds of blocks keep most multiprocessors busy in the last one; each block has at least eight steps.
+        let shares = (4 * self.products.blocks as usize / tiles).clamp(1, (rows / (8 * DEPTH)).max(1));
+        let (n, held, share) = (rows as u32, training.rows as u32, rows.div_ceil(shares).next_multiple_of(DEPTH) as u32);
+        let encoded = training.encoded.address_of(range.start * self.tiling.encoded);
+        let (values, deltas) = (training.values.address_of(range.start * width), training.deltas.address_of(range.start * width));
+        let config = LaunchConfig { grid_dim: (tiles as u32, shares as u32, 1), ..self.products.config(1) };
+        let mut call = self.gpu.work().launch_builder(&self.products.function);
+        call.arg(&encoded).arg(&values).arg(&deltas).arg(&n).arg(&held).arg(&share).arg(&to).arg(&factor);
+        // SAFETY: the arguments of `batched_products`, with one block per share of a panel.
+        unsafe { launch(&mut call, config) }
+    }
+
     fn alloc_training(&self) -> Result<Training, DeviceError> {
-        let (width, tile) = (self.tiling.width(), self.tiling.rows);
-        let rows = (MAX_TRAINING_VALUES / (2 * width * self.hidden)).clamp(tile, MAX_TRAINING_ROWS) / tile * tile;
+        let (width, tile) = (self.tiling.width(), self.groups * self.tiling.rows);
+        let rows = (MAX_TRAINING_VALUES / (2 * width * self.hidden)).clamp(tile, self.groups * MAX_TRAINING_ROWS) / tile * tile;
+        let passed_layers = if self.groups > 1 { self.hidden } else { self.hidden - 1 };
         Ok(Training {
             rows,
             encoded: self.gpu.alloc("encoded samples", rows * self.tiling.encoded)?,
             values: self.gpu.alloc("the layers' values", self.hidden * rows * width)?,
             deltas: self.gpu.alloc("gradients of the layers' values", self.hidden * rows * width)?,
-            passed: self.relu_bits(&self.gradient, self.hidden - 1)?,
+            passed: self.relu_bits(&self.gradient, passed_layers)?,
         })
     }
 

@@ -12,9 +12,9 @@ mod training;
 
 pub use batched::Tiling;
 pub(super) use layout::UnitBoxArgument;
-pub use network::{DeviceNetwork, NetworkAbove, is_fused, network_defines};
+pub use network::{DeviceNetwork, LossTerms, NetworkAbove, is_fused, network_defines};
 pub use resident::{CudaTable, CudaTraining, OnGpu};
 pub(super) use resident::{LabelPool, LabelSink, frozen_parts, seconds_of_prediction, trace_labels};
-pub use samples::DeviceSamples;
 pub(super) use samples::Filled;
+pub use samples::{DeviceLabels, DeviceSamples};
 pub use training::DeviceTraining;

@@ -34,14 +34,25 @@ pub fn is_fused(shape: &Architecture, shared_memory: usize) -> bool {
     hidden <= MAX_DEPTH && width <= MAX_WIDTH && shape.encoded() <= MAX_WIDTH && workspace <= shared_memory
 }
 
-/// Returns true if the loss has a penalty on the difference of the batch means.
-pub(super) fn has_penalty(objective: &Objective) -> bool {
-    objective.target == Target::Ftle && objective.loss == Loss::Published && objective.mean_penalty != 0.0
+/// Terms of a loss besides the squared errors of the outputs, for which kernels are compiled.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LossTerms {
+    /// A penalty on the difference of the batch means.
+    pub mean_penalty: bool,
+    /// The squared errors of the flow map's derivatives.
+    pub derivatives: bool,
 }
 
-/// Macros of `network*.cu` for an architecture and a loss with or without a penalty on means. `None` if the architecture has no hidden layer or
-/// is the flow map of a single axis.
-pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String>> {
+impl LossTerms {
+    /// The terms of this objective.
+    pub fn of(objective: &Objective) -> Self {
+        let is_published = objective.target == Target::Ftle && objective.loss == Loss::Published;
+        Self { mean_penalty: is_published && objective.mean_penalty != 0.0, derivatives: objective.derivatives() }
+    }
+}
+
+/// Macros of `network*.cu` for an architecture and a loss. `None` if the architecture has no hidden layer or is the flow map of a single axis.
+pub fn network_defines(shape: &Architecture, terms: LossTerms) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
     let flow_map = shape.target == Target::FlowMap;
     if hidden == 0 || (flow_map && shape.dimensions() < 2) {
@@ -54,7 +65,8 @@ pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String
         format!("RW_DIMS={}", shape.inputs()),
         format!("RW_SPACE={}", shape.dimensions()),
         format!("RW_FLOW_MAP={}", u8::from(flow_map)),
-        format!("RW_PENALTY={}", u8::from(penalty)),
+        format!("RW_DERIVATIVES={}", u8::from(terms.derivatives)),
+        format!("RW_PENALTY={}", u8::from(terms.mean_penalty)),
         format!("RW_LEVELS={}", shape.levels.len()),
         format!("RW_FEATURES={}", shape.features),
         format!("RW_OCTAVES={}", shape.octaves),
@@ -74,20 +86,20 @@ fn places(shape: &Architecture) -> Vec<usize> {
     shape.space().iter().copied().chain(free.take(shape.times().len())).collect()
 }
 
-/// `PLACES` of `network.cuh`, and floats of a sample, in whole `Float4`s.
-fn sample_room(shape: &Architecture) -> [usize; 2] {
-    let places = shape.inputs().max(POINT);
-    [places, (places + shape.outputs()).next_multiple_of(4)]
+/// `PLACES` of `network.cuh`.
+fn sample_places(shape: &Architecture) -> usize {
+    shape.inputs().max(POINT)
 }
 
 /// Places of a sample beyond its point.
 pub(super) fn further_places(shape: &Architecture) -> usize {
-    sample_room(shape)[0] - POINT
+    sample_places(shape) - POINT
 }
 
-/// `Float4`s of a sample.
-pub(super) fn sample_float4s(shape: &Architecture) -> usize {
-    sample_room(shape)[1] / 4
+/// `Float4`s of a sample: places, targets, and targets of the derivatives if the loss has them.
+pub(super) fn sample_float4s(shape: &Architecture, objective: &Objective) -> usize {
+    let groups = if objective.derivatives() { 1 + shape.dimensions() } else { 1 };
+    (sample_places(shape) + groups * shape.outputs()).div_ceil(4)
 }
 
 /// Unit times at their places; NaN at the other places. Without `times` a point supplies its own values at its three places.
@@ -115,6 +127,22 @@ fn tangent_step(shape: &Architecture) -> f32 {
     step.log2().round().exp2()
 }
 
+/// Tangents of a loss with derivatives: their length, and the factor of their squared errors beside those of the values.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TangentTerm {
+    pub(super) step: f32,
+    pub(super) factor: f32,
+}
+
+impl TangentTerm {
+    /// `None` if the loss has no derivatives.
+    pub(super) fn of(shape: &Architecture, objective: &Objective) -> Option<Self> {
+        let step = tangent_step(shape);
+        let factor = objective.jacobian_weight / (shape.dimensions() as f32 * step * step);
+        objective.derivatives().then_some(Self { step, factor })
+    }
+}
+
 /// Sizes of `Weights` of `network.cuh` and `Workspace` of `network_fused.cu`, which asserts them.
 fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     let hidden = shape.layers.len() - 1;
@@ -125,10 +153,10 @@ fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     (weights, weights + 2 * TILE * (encoded.max(width) + 8 + row))
 }
 
-/// Kernels of prediction and gradient.
+/// Kernels of prediction and gradient. `tangents`: the gradient of the derivatives, if the loss has them.
 #[derive(Debug)]
 enum Path {
-    Fused { predict: Resident, gradient: Resident },
+    Fused { predict: Resident, gradient: Resident, tangents: Option<Resident> },
     Batched(Box<Batched>),
 }
 
@@ -160,7 +188,8 @@ impl NetworkKernels {
             let (major, minor) = gpu.capability();
             return refuse(format!("a network on compute capability {major}.{minor}; networks need 8.0 or later"));
         }
-        let Some(defines) = network_defines(shape, has_penalty(objective)) else {
+        let terms = LossTerms::of(objective);
+        let Some(defines) = network_defines(shape, terms) else {
             return refuse(format!(
                 "a network of {} hidden layers with inputs {} and target {:?}; the GPU needs at least one hidden layer, and two or three axes for a flow map",
                 shape.layers.len() - 1,
@@ -173,9 +202,13 @@ impl NetworkKernels {
         let (weights, workspace) = shared_bytes(shape);
         let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, THREADS, shared);
         let path = if is_fused(shape, gpu.shared_memory()) {
-            Path::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? }
+            Path::Fused {
+                predict: fused("network_predict", weights)?,
+                gradient: fused("network_gradient", workspace)?,
+                tangents: terms.derivatives.then(|| fused("network_tangent_gradient", workspace)).transpose()?,
+            }
         } else if let Some(tiling) = Tiling::of(shape, gpu.shared_memory()) {
-            Path::Batched(Box::new(Batched::new(gpu, shape, grid, &defines, tiling)?))
+            Path::Batched(Box::new(Batched::new(gpu, shape, grid, (&defines, terms), tiling)?))
         } else {
             let (width, most) = (shape.layers[0].outputs, gpu.shared_memory());
             return refuse(format!("a network of width {width}: a tile of its values exceeds {most} bytes of shared memory"));
@@ -224,19 +257,33 @@ impl NetworkKernels {
         }
     }
 
-    /// Adds the gradient and the loss of a batch.
+    /// Adds the gradient and the loss of a batch. `term`: tangents of the objective for which the kernels were compiled.
     ///
     /// # Safety
     /// Device addresses as for [`Self::predict`]; the samples of `draw` are there, and room for the gradients.
-    pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
+    pub(super) unsafe fn gradient(
+        &self,
+        halves: u64,
+        layers: u64,
+        draw: &DrawArgument,
+        term: Option<TangentTerm>,
+        to: GradientTo,
+    ) -> Result<(), DeviceError> {
         match &self.path {
             // SAFETY: as required of the caller.
-            Path::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, to) },
-            Path::Fused { gradient, .. } => {
+            Path::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, term, to) },
+            Path::Fused { gradient, tangents, .. } => {
+                let blocks = (draw.batch as usize).div_ceil(TILE);
                 let mut call = self.gpu.work().launch_builder(&gradient.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&to.tables).arg(&to.layers).arg(&to.loss);
                 // SAFETY: as required of the caller; the arguments are those of `network_gradient`.
-                unsafe { launch(&mut call, gradient.config((draw.batch as usize).div_ceil(TILE))) }
+                unsafe { launch(&mut call, gradient.config(blocks)) }?;
+                let (Some(tangents), Some(TangentTerm { step, factor })) = (tangents, term) else { return Ok(()) };
+                let mut call = self.gpu.work().launch_builder(&tangents.function);
+                call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&step).arg(&factor);
+                call.arg(&to.tables).arg(&to.layers).arg(&to.loss);
+                // SAFETY: as above; the arguments are those of `network_tangent_gradient`.
+                unsafe { launch(&mut call, tangents.config(blocks)) }
             }
         }
     }
@@ -352,7 +399,7 @@ impl DeviceNetwork {
     pub fn takes(gpu: &Gpu, shape: &Architecture) -> bool {
         let most = gpu.shared_memory();
         gpu.capability() >= MIN_CAPABILITY
-            && network_defines(shape, false).is_some()
+            && network_defines(shape, LossTerms::default()).is_some()
             && (is_fused(shape, most) || Tiling::of(shape, most).is_some())
     }
 

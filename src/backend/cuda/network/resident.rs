@@ -2,7 +2,7 @@
 //!
 //! Training draws from two sets of samples on the device: a copy of the host's replay buffer, and the label pool, which frames fill on the device.
 
-use super::samples::{Filled, SampleWriter, TracedBatch};
+use super::samples::{DeviceLabels, Filled, SampleWriter, TracedBatch};
 use super::training::NetworkCopy as DeviceCopy;
 use super::{DeviceNetwork, DeviceSamples, DeviceTraining};
 use crate::DeviceError;
@@ -141,9 +141,16 @@ pub(in crate::cuda) fn trace_labels(
     let gpu = tracer.device().gpu();
     let mut points = gpu.alloc::<[f32; 3]>("points of labels", count)?;
     let log_stretch = gpu.alloc::<f32>("labels", count)?;
-    let arrival = (sink.pool.writer.target() == Target::FlowMap).then(|| gpu.alloc::<[f32; 3]>("labels", count)).transpose()?;
+    let writer = &sink.pool.writer;
+    let arrival = (writer.target() == Target::FlowMap).then(|| gpu.alloc::<[f32; 3]>("labels", count)).transpose()?;
+    let jacobian = writer.objective.derivatives().then(|| gpu.alloc::<[f32; 9]>("labels", count)).transpose()?;
     resident.training.draw_points(domain, seed, first, &mut points)?;
-    let out = Outputs { log_stretch: log_stretch.address(), arrival: arrival.as_ref().map_or(0, Buffer::address), ..Outputs::default() };
+    let out = Outputs {
+        log_stretch: log_stretch.address(),
+        arrival: arrival.as_ref().map_or(0, Buffer::address),
+        jacobian: jacobian.as_ref().map_or(0, Buffer::address),
+        ..Outputs::default()
+    };
     // SAFETY: every buffer holds `count` entries and is freed in the order of the work stream.
     unsafe {
         tracer.device().trace(points.address(), count, &out)?;
@@ -237,13 +244,14 @@ pub(in crate::cuda) struct LabelSink<'a> {
 impl DeviceLearns for LabelSink<'_> {
     unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
         let (writer, mut samples) = (&self.pool.writer, self.pool.samples());
-        let labels = match writer.target() {
+        let values = match writer.target() {
             Target::Ftle => traced.log_stretch,
             Target::FlowMap => traced.arrival,
         };
-        if labels == 0 {
+        if values == 0 || (writer.objective.derivatives() && traced.jacobian == 0) {
             return Ok(());
         }
+        let labels = DeviceLabels { values, jacobians: traced.jacobian };
         let (base, times) = (self.base, Some(self.times));
         let batch = TracedBatch { domain: self.domain, points, labels, count, base, times, held_back: HELD_BACK };
         // SAFETY: guaranteed by the caller.

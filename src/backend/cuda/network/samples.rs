@@ -19,6 +19,21 @@ pub(super) struct SampleWriter {
     pub(super) objective: Objective,
 }
 
+/// Device addresses of the labels of traced points.
+#[derive(Debug, Clone, Copy)]
+pub struct DeviceLabels {
+    /// Log-stretch (one f32 per point), or for a flow map arrivals (three f32 per point, in domain coordinates).
+    pub values: u64,
+    /// Jacobians (nine f32 per point, row-major, in domain coordinates), which a loss with derivatives needs; 0 if there are none.
+    pub jacobians: u64,
+}
+
+impl From<u64> for DeviceLabels {
+    fn from(values: u64) -> Self {
+        Self { values, jacobians: 0 }
+    }
+}
+
 /// Traced points on the device that become samples. Addresses are device addresses.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct TracedBatch<'a> {
@@ -26,8 +41,8 @@ pub(super) struct TracedBatch<'a> {
     pub(super) domain: &'a Domain,
     /// Three f32 per point, with its times at the places of unused axes unless `times` are given.
     pub(super) points: u64,
-    /// Log-stretch (one f32 per point), or for a flow map arrivals (three f32 per point, in domain coordinates).
-    pub(super) labels: u64,
+    /// Their labels.
+    pub(super) labels: DeviceLabels,
     /// Number of points.
     pub(super) count: usize,
     /// Table to which the network adds.
@@ -65,6 +80,11 @@ impl SampleWriter {
         }
     }
 
+    /// Jacobians of samples on the host. `None` if the loss does not need them or the samples have none.
+    pub(super) fn jacobians<'a>(&self, samples: &'a Samples, range: Range<usize>) -> Option<&'a [[f32; 9]]> {
+        samples.jacobian.get(range).filter(|_| self.objective.derivatives())
+    }
+
     /// Target of the network.
     pub(super) fn target(&self) -> Target {
         self.kernels.shape.target
@@ -72,7 +92,7 @@ impl SampleWriter {
 
     /// Bytes of a sample.
     pub(super) fn sample_bytes(&self) -> usize {
-        size_of::<[f32; 4]>() * sample_float4s(&self.kernels.shape)
+        size_of::<[f32; 4]>() * sample_float4s(&self.kernels.shape, &self.objective)
     }
 
     /// Writes samples of traced points from number `first` on. `further`: device address of the times without a place in a point, 0 if the
@@ -93,8 +113,9 @@ impl SampleWriter {
         }
         let reading = ReadingArgument { further, ..reading(shape, &self.objective, times, base, 1.0) };
         let (n, at) = (count as u32, to.samples.address_of(to.float4s * first));
+        let DeviceLabels { values, jacobians } = labels;
         let mut call = self.kernels.gpu.work().launch_builder(&self.kernels.samples);
-        call.arg(&domain).arg(&reading).arg(&points).arg(&labels).arg(&n).arg(&held_back).arg(&at);
+        call.arg(&domain).arg(&reading).arg(&points).arg(&values).arg(&n).arg(&held_back).arg(&at).arg(&jacobians);
         // SAFETY: the arguments of `network_samples`; the caller's addresses, and `count` samples fit behind `at`.
         unsafe { launch(&mut call, threads(count, 256)) }
     }
@@ -110,7 +131,10 @@ impl SampleWriter {
         let before_the_end = (count - skipped).min(capacity - to.filled.next);
         for (from, count) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
             let (first, from) = (to.filled.next, from as u64);
-            let part = TracedBatch { points: batch.points + 12 * from, labels: batch.labels + label_bytes * from, count, ..batch };
+            let DeviceLabels { values, jacobians } = batch.labels;
+            let jacobians = if jacobians == 0 { 0 } else { jacobians + 36 * from };
+            let labels = DeviceLabels { values: values + label_bytes * from, jacobians };
+            let part = TracedBatch { points: batch.points + 12 * from, labels, count, ..batch };
             // Counted before the write: even if it fails, the old samples there are lost.
             to.filled.append(count, capacity);
             // SAFETY: as required of the caller.
@@ -120,7 +144,7 @@ impl SampleWriter {
     }
 }
 
-/// Replay buffer of samples (unit point, further times, targets): a ring in which the newest samples replace the oldest.
+/// Replay buffer of samples (unit point, further times, targets, targets of derivatives): a ring in which the newest samples replace the oldest.
 #[derive(Debug)]
 pub struct DeviceSamples {
     pub(super) samples: Buffer<[f32; 4]>,
@@ -185,7 +209,8 @@ impl DeviceSamples {
         self.filled = Filled::default();
     }
 
-    /// Downloads unit point, further times and targets of each sample, in one or two groups of four numbers.
+    /// Downloads unit point, further times, targets and, if the loss has them, the derivatives' targets along each axis of each sample, in groups of
+    /// four numbers.
     ///
     /// # Errors
     /// Error of the driver.

@@ -7,9 +7,9 @@
 use crate::cuda::network::batched::GradientTo;
 use crate::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
 use crate::cuda::network::network::{
-    DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_float4s, unit_box,
+    DeviceNetwork, LossTerms, NetworkKernels, TangentTerm, copied, copy, further_places, reading, sample_float4s, unit_box,
 };
-use crate::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedBatch};
+use crate::cuda::network::samples::{DeviceLabels, DeviceSamples, Filled, SampleWriter, TracedBatch};
 use crate::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use cudarc::driver::PushKernelArg;
 use ridgewatch_field::Domain;
@@ -161,20 +161,11 @@ impl WholeBatch {
 }
 
 impl DeviceTraining {
-    /// Returns true if this device can train networks of this architecture.
-    pub fn takes(gpu: &Gpu, shape: &Architecture, objective: &Objective) -> bool {
-        DeviceNetwork::takes(gpu, shape) && !objective.derivatives()
-    }
-
     /// Uploads a model. The running mean of the parameters starts at their values.
     ///
     /// # Errors
-    /// Training on derivatives of the flow map is not supported, a kernel does not compile, or out of memory.
+    /// The architecture is not supported ([`DeviceNetwork::takes`]), a kernel does not compile, or out of memory.
     pub fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective) -> Result<Self, DeviceError> {
-        if objective.derivatives() {
-            let what = "training on the derivatives of the flow map (network.jacobian_weight)".into();
-            return Err(DeviceError::Unsupported { what });
-        }
         let kernels = NetworkKernels::new(gpu, &model.shape, objective)?;
         let [tables, layers] = model.state();
         let training = Self {
@@ -199,7 +190,7 @@ impl DeviceTraining {
     /// Out of memory.
     pub fn reserve(&mut self, batch: usize) -> Result<(), DeviceError> {
         let SampleWriter { kernels, objective } = &self.writer;
-        if has_penalty(objective) {
+        if LossTerms::of(objective).mean_penalty {
             self.batch = Some(WholeBatch::new(&self.gpu, &kernels.shape, batch)?);
         }
         kernels.reserve()
@@ -207,10 +198,10 @@ impl DeviceTraining {
 
     /// Device memory of a network in training with `capacity` samples, bytes: parameters, moments, mean and gradient, the state to roll back to,
     /// rounded tables, and two frozen copies.
-    pub(in crate::cuda) fn bytes(shape: &Architecture, capacity: usize) -> u64 {
+    pub(in crate::cuda) fn bytes(shape: &Architecture, objective: &Objective, capacity: usize) -> u64 {
         const STATE: u64 = 9 * size_of::<f32>() as u64;
         const ROUNDED: u64 = 3 * size_of::<u16>() as u64;
-        let samples = size_of::<[f32; 4]>() * sample_float4s(shape) * capacity;
+        let samples = size_of::<[f32; 4]>() * sample_float4s(shape, objective) * capacity;
         (STATE + ROUNDED) * shape.parameters() as u64 + samples as u64
     }
 
@@ -325,7 +316,7 @@ impl DeviceTraining {
     /// # Errors
     /// Out of memory.
     pub fn replay_buffer(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
-        let float4s = sample_float4s(self.shape());
+        let float4s = sample_float4s(self.shape(), &self.writer.objective);
         Ok(DeviceSamples { samples: self.gpu.alloc("samples", float4s * capacity)?, float4s, filled: Filled::default() })
     }
 
@@ -359,7 +350,9 @@ impl DeviceTraining {
             let (points, further) = self.writer.placed(samples, part.clone());
             let (points, further) = (self.gpu.upload("samples", &points)?, self.gpu.upload("samples", &further)?);
             let labels = self.gpu.upload("samples", &self.writer.labels(samples, part.clone()))?;
-            let (points, labels, count) = (points.address(), labels.address(), part.len());
+            let jacobians = self.writer.jacobians(samples, part.clone()).map(|all| self.gpu.upload("samples", all)).transpose()?;
+            let labels = DeviceLabels { values: labels.address(), jacobians: jacobians.as_ref().map_or(0, Buffer::address) };
+            let (points, count) = (points.address(), part.len());
             let batch = TracedBatch { domain: &unit, points, labels, count, base, times: None, held_back: 0 };
             // SAFETY: these buffers hold `count` entries and are freed in the order of the work stream.
             unsafe { self.writer.write(buffer, part.start, batch, further.address()) }?;
@@ -388,8 +381,7 @@ impl DeviceTraining {
     }
 
     /// Appends traced points on the device: `count` points (three f32 each, coordinates of `domain`, with times at the places of unused axes)
-    /// and their labels: log-stretch (f32 each), or for a flow map arrivals (three f32 each, coordinates of `domain`). Training skips samples
-    /// that are not finite.
+    /// and their labels. Training skips samples that are not finite; with derivatives in the loss, those without Jacobians are not.
     ///
     /// # Errors
     /// Error of the driver.
@@ -398,17 +390,17 @@ impl DeviceTraining {
     /// If `count` exceeds the buffer's capacity.
     ///
     /// # Safety
-    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
+    /// The memory at all addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
     pub unsafe fn append(
         &self,
         buffer: &mut DeviceSamples,
         domain: &Domain,
         points: u64,
-        labels: u64,
+        labels: impl Into<DeviceLabels>,
         count: usize,
         base: Option<&DeviceTable>,
     ) -> Result<(), DeviceError> {
-        let capacity = buffer.capacity();
+        let (capacity, labels) = (buffer.capacity(), labels.into());
         assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
         // SAFETY: as required of the caller.
         unsafe { self.writer.append(buffer, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
@@ -432,7 +424,7 @@ impl DeviceTraining {
         count: usize,
         times: [f32; 2],
     ) -> Result<(), DeviceError> {
-        let capacity = buffer.capacity();
+        let (capacity, labels) = (buffer.capacity(), labels.into());
         assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
         // SAFETY: as required of the caller.
         unsafe { self.writer.append(buffer, TracedBatch { domain, points, labels, count, base: None, times: Some(times), held_back: 0 }) }
@@ -511,7 +503,7 @@ impl DeviceTraining {
         let addresses = |of: &Moments| [&of.parameters, &of.first, &of.second, &of.gradient].map(Buffer::address);
         let [table_parameters, table_first, table_second, table_gradient] = addresses(tables);
         let [layer_parameters, layer_first, layer_second, layer_gradient] = addresses(layers);
-        if has_penalty(objective) {
+        if LossTerms::of(objective).mean_penalty {
             let batch = match batch.take().filter(|batch| batch.points.len() >= step.count) {
                 Some(batch) => batch,
                 None => WholeBatch::new(gpu, &kernels.shape, step.count)?,
@@ -522,7 +514,7 @@ impl DeviceTraining {
         }
         let to = GradientTo { tables: table_gradient, layers: layer_gradient, loss };
         // SAFETY: buffers are of this architecture, indices of samples below their number.
-        unsafe { kernels.gradient(halves, layer_parameters, &draw, to) }?;
+        unsafe { kernels.gradient(halves, layer_parameters, &draw, TangentTerm::of(&kernels.shape, objective), to) }?;
 
         self.time += 1;
         let adam = Adam::at(self.time, step.rate, self.epsilon);
