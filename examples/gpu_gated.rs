@@ -266,12 +266,8 @@ fn main() {
             assert!(record.device.starts_with("cuda") && record.speculative_traces > 0, "{:?}", record.warnings);
         }
         // Once the loss has stalled, turns are left out.
-        let is_trained = |record: &FrameRecord| record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some());
-        let trained = records.iter().filter(|record| is_trained(record)).count();
-        assert!(
-            !is_network || if warm_up == LEARNED { trained > 0 } else { trained == FRAMES },
-            "{name}: trained there in {trained} frames"
-        );
+        let is_trained = |record: &FrameRecord| record.training.as_ref().is_some_and(|l| l.device_seconds.is_some() && l.steps > 0);
+        assert!(!is_network || records.iter().any(is_trained), "{name}: trained there");
     }
     println!();
 

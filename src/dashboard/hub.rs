@@ -358,7 +358,8 @@ impl Hub {
         let now = Instant::now();
         let (work, marks) =
             if self.is_beside_run { (progress::work().map(|words| short(&words)), progress::marks()) } else { health.told_work(now) };
-        let is_at_work = health.has_new_marks(marks, now) && work.is_some();
+        // Marks that nobody told are none.
+        let is_at_work = work.is_some() && health.has_new_marks(marks, now);
         let state = State {
             kind: "state",
             endpoint: &self.endpoint,

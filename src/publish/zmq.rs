@@ -59,8 +59,14 @@ impl Publisher {
         let bound = PubSocket::bind(&endpoint, settings.peers.map(Into::into), limits);
         let socket = Arc::new(bound.map_err(|error| PublishError::of_bind(&endpoint, error))?);
         let mailbox = Arc::new(Mailbox::default());
-        let (theirs, payload) = ((Arc::clone(&mailbox), Arc::clone(&socket)), settings.payload);
-        let worker = Worker { mailbox: theirs.0, socket: theirs.1, payload, said: (0, 0), told: None, is_at_work: false };
+        let worker = Worker {
+            mailbox: Arc::clone(&mailbox),
+            socket: Arc::clone(&socket),
+            payload: settings.payload,
+            said: (0, 0),
+            told: None,
+            is_at_work: false,
+        };
         let name = "ridgewatch-publish";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())

@@ -315,10 +315,12 @@ impl Run<'_> {
                 let mut trained = Ok(());
                 if let (true, Ok(work)) = (waits, &work) {
                     let due = if device_trains { settings.turn(work.device_share(), factor) } else { settings.seconds(factor) };
-                    let until = Until::Seconds(need.turn(due).max(settings.seconds_per_frame.unwrap_or(0.0)));
-                    let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
-                    trained = threads.render().install(|| train(learn, settings, until, stop, &mut learned, need));
-                    need.took(learned.seconds);
+                    let turn = need.turn(due).max(settings.seconds_per_frame.unwrap_or(0.0));
+                    if turn > 0.0 || settings.steps_per_frame.is_some() {
+                        let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+                        trained = threads.render().install(|| train(learn, settings, Until::Seconds(turn), stop, &mut learned, need));
+                        need.took(learned.device_seconds.unwrap_or(learned.seconds), learned.steps);
+                    }
                 }
                 (work, trained)
             }

@@ -24,6 +24,10 @@ const SURE: f64 = 3.0;
 const RISE: f64 = 0.25;
 /// Steps over which the loss is smoothed to see it rise.
 const RECENT_STEPS: f64 = 64.0;
+/// Seconds of the shortest turn while the loss has stalled: a shorter one may end before its first step, since samples are counted before.
+const LEAST_TURN: f64 = 0.01;
+/// Seconds that may be due, or made up for, at most.
+const MOST_DUE: f64 = 1.0;
 /// Share of the domain's volume whose loss of trust ends a stall.
 const LOST_TRUST: f64 = 0.1;
 
@@ -54,7 +58,7 @@ struct Stall {
 }
 
 /// Judges from the losses of training how much of it is needed.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Need {
     /// Steps since the network or its labels changed.
     steps: u64,
@@ -65,6 +69,14 @@ pub(super) struct Need {
     stall: Option<Stall>,
     /// Seconds of training that are due; below 0 if the last turns took longer than was due.
     owed: f64,
+    /// Seconds of the next turn at least: more after one that was too short for a step.
+    least_turn: f64,
+}
+
+impl Default for Need {
+    fn default() -> Self {
+        Self { steps: 0, blocks: VecDeque::new(), open: Block::default(), stall: None, owed: 0.0, least_turn: LEAST_TURN }
+    }
 }
 
 impl Need {
@@ -111,18 +123,28 @@ impl Need {
         }
     }
 
-    /// Seconds of the next turn of training, of which `due` come with the present frame. A turn takes a step at least; while the loss has
-    /// stalled, the next turns are shorter or left out until that is made up for.
+    /// Seconds of the next turn of training, of which `due` come with the present frame. While the loss has stalled, turns are left out until
+    /// enough is due for one that takes a step.
     pub(super) fn turn(&mut self, due: f64) -> f64 {
-        self.owed = if self.stall.is_some() { self.owed + due } else { due };
-        // Time missed while there was nothing to learn is not made up.
-        self.owed = self.owed.min(due);
-        self.owed.max(0.0)
+        if self.stall.is_none() {
+            self.owed = due;
+            return due;
+        }
+        self.owed = (self.owed + due).min(MOST_DUE.max(due));
+        if self.owed >= self.least_turn { self.owed } else { 0.0 }
     }
 
-    /// Subtracts the seconds that a turn took.
-    pub(super) fn took(&mut self, seconds: f64) {
-        self.owed -= seconds;
+    /// Subtracts the seconds that a turn took for its steps.
+    pub(super) fn took(&mut self, seconds: f64, steps: u64) {
+        self.owed = (self.owed - seconds).max(-MOST_DUE);
+        self.least_turn = if steps > 0 { LEAST_TURN } else { (2.0 * seconds).clamp(LEAST_TURN, MOST_DUE) };
+    }
+
+    /// The window has slid, and the labels hold: what is trusted of it shows anew.
+    pub(super) fn window_slid(&mut self) {
+        if let Some(stall) = &mut self.stall {
+            stall.trusted = 0.0;
+        }
     }
 
     /// Compares the last quarter of the steps with the one before. While noise hides whether the loss stands, it has not stalled.
@@ -300,15 +322,35 @@ mod tests {
         let mut trained = 0.0;
         for _ in 0..10_000 {
             if need.turn(due) > 0.0 {
-                need.took(step);
+                need.took(step, 1);
                 trained += step;
             }
         }
         assert!((trained - 10_000.0 * due).abs() <= step, "{trained} s");
+        // A wait that no step caused is not made up for without end.
+        need.took(100.0, 1);
+        assert!((0..2_000).any(|_| need.turn(due) > 0.0), "training goes on within two thousand frames");
         need.restart();
         for _ in 0..3 {
             assert_eq!(need.turn(due), due);
-            need.took(step);
+            need.took(step, 1);
+        }
+    }
+
+    /// Fails if a turn is as short as what is due with a frame: it would end before its first step, and no loss would show that training is needed.
+    #[test]
+    fn a_turn_becomes_long_enough_for_a_step() {
+        for (due, before) in [(1e-5, 0.002), (0.0002, 0.002), (0.0002, 0.05), (0.002, 0.4)] {
+            let (mut need, mut steps) = (Training::stalled(0).need, 0);
+            for _ in 0..1_000_000 {
+                let turn = need.turn(due);
+                if turn > 0.0 {
+                    let taken = u64::from(turn > before);
+                    steps += taken;
+                    need.took(turn.max(before), taken);
+                }
+            }
+            assert!(steps > 2, "{due} s a frame, steps after {before} s: {steps}");
         }
     }
 }

@@ -114,6 +114,8 @@ impl Run<'_> {
             learning.need.restart();
             learning.buffer.mark_stale();
             learning.buffer.revalidate(share);
+        } else {
+            learning.need.window_slid();
         }
         if !self.plan.scene.network.inputs.is_empty() {
             learning.buffer.set_now(learning.times.unit(flow.start(), flow.tau()));

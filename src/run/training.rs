@@ -144,7 +144,10 @@ pub(super) fn train(
                 break;
             }
         };
-        need.observe(&slice);
+        // A given number of steps is what is needed.
+        if settings.steps_per_frame.is_none() {
+            need.observe(&slice);
+        }
         let learns = slice.steps > 0;
         sum = sum.and(slice);
         if !learns {

@@ -200,14 +200,17 @@ pub fn errors_of_tiles(tiles: &[TileSums]) -> Vec<TileError> {
     dark.into_iter().zip(lit).map(|(dark, lit)| [dark, lit]).collect()
 }
 
-/// Mean square errors of tiles, drawn to their mean.
+/// Mean square errors of tiles, drawn to their mean. NaN for a tile whose sums are not finite, which tells nothing about others.
 fn drawn_together(tiles: &[TileErrors]) -> Vec<f32> {
-    let mean = estimate(tiles.iter(), 0).value;
+    let is_finite = |tile: &&TileErrors| tile.squared[0].is_finite() && tile.scatter[0].is_finite();
+    let found = estimate(tiles.iter().filter(is_finite), 0);
+    // No difference seen is not none.
+    let mean = if found.value > 0.0 { found.value } else { found.high };
     if !mean.is_finite() {
         return vec![f32::NAN; tiles.len()];
     }
     let (mut noise, mut apart, mut count, mut squares) = (0.0, 0.0, 0.0, 0.0);
-    for tile in tiles {
+    for tile in tiles.iter().filter(is_finite) {
         let pixels = f64::from(tile.pixels);
         noise += f64::from(tile.scatter[0]).powi(2);
         apart += (f64::from(tile.squared[0]) - mean * pixels).powi(2);
@@ -217,6 +220,9 @@ fn drawn_together(tiles: &[TileErrors]) -> Vec<f32> {
     // Variances of what tiles differ by, and of the noise of a pixel.
     let (own, noise) = ((apart - noise).max(0.0) / squares, noise / count);
     let of_tile = |tile: &TileErrors| {
+        if !is_finite(&tile) {
+            return f32::NAN;
+        }
         let pixels = f64::from(tile.pixels);
         let trusted = if pixels > 0.0 && own > 0.0 { own * pixels / (own * pixels + noise) } else { 0.0 };
         let seen = f64::from(tile.squared[0]) / pixels.max(1.0);
@@ -352,6 +358,18 @@ mod tests {
         let dark = TileSums { lit: TileErrors::default(), ..tiles[0] };
         let found = errors_of_tiles(&[dark; 4]);
         assert!(found.iter().all(|error| error[0] > 0.0 && error[1] == error[0]), "{found:?}");
+        // A tile that is no number is no other's fault.
+        tiles[3].all.squared[0] = f32::NAN;
+        tiles[3].lit.squared[0] = f32::NAN;
+        let found = errors_of_tiles(&tiles);
+        assert!(found.iter().enumerate().all(|(tile, error)| error[1].is_nan() == (tile == 3)), "{found:?}");
+        // Dark pixels whose pairs show no difference.
+        let mut seen = tiles_of(&[1.0; 4], 0.1);
+        seen.iter_mut().for_each(|tile| {
+            tile.all.squared = tile.lit.squared;
+            tile.all.radiance = [2.56; 3];
+        });
+        assert!(errors_of_tiles(&seen).iter().all(|error| error[0] > 0.0), "none seen is not none");
     }
 
     #[test]

@@ -331,6 +331,8 @@ struct Reader {
     stride: usize,
     /// Every how many complete steps one is taken.
     every: u64,
+    /// Complete steps since the window began.
+    seen: u64,
     late: u32,
     /// [`LARGE`].
     large: usize,
@@ -340,7 +342,7 @@ impl Reader {
     fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
         let limit = Duration::from_secs_f64(live.settings.block_timeout_seconds);
         let assembler = Assembler::new(&live.description, limit, MAX_PENDING);
-        Self { live, shared, assembler, conversion, thinning, stride, every: 1, late: 0, large: LARGE }
+        Self { live, shared, assembler, conversion, thinning, stride, every: 1, seen: 0, late: 0, large: LARGE }
     }
 
     fn run(&mut self) {
@@ -417,10 +419,12 @@ impl Reader {
                 state.warn(format!("the simulation went back from time {newest} to {time}: the window begins anew"));
                 state.restart();
                 self.thinning.restart();
+                self.seen = 0;
             }
         }
         // Not by its number: a simulation may publish every tenth step.
-        let is_taken = state.live.steps.is_multiple_of(self.every.max(1));
+        let is_taken = self.seen.is_multiple_of(self.every.max(1));
+        self.seen += 1;
         state.live.steps += 1;
         if !is_taken {
             drop(state);
