@@ -279,8 +279,9 @@ pub(super) fn check_gradients(case: &Case) {
     }
     let from_differences = norm(&apart) / norm(&differences);
     measured!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
-    // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
-    assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
+    // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3, and more in derivatives, which jump there.
+    let most = if objective.derivatives() { 1e-2 } else { 3e-3 };
+    assert!(from_burn < most && from_differences < most, "{}: {from_burn} {from_differences}", case.name);
 }
 
 /// What does not fit into a warp's registers goes through the network in parts: these batches are of several (but for small ones).
