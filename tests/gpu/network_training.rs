@@ -177,12 +177,7 @@ fn training_learns_of_derivatives_what_the_cpu_learns() {
         let (count, all) = (4096, 150);
         let steps = drawn_steps(count, all);
         let found = device.train_steps(&pool, None, &steps).unwrap();
-        let mut average = Average { tables: model.tables(), layers: model.layers() };
-        let mut expected = Vec::new();
-        Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
-            expected.extend(loss);
-            steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
-        });
+        let (expected, _) = trained_by_cpu(&mut model, &objective, &samples, &steps);
         let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;
         let (ours, theirs) = (mean(&found), mean(&expected));
         measured!("{name}: losses of {all} steps with derivatives: GPU {:.2e} to {ours:.3e}, CPU to {theirs:.3e}", found[0]);
@@ -191,6 +186,17 @@ fn training_learns_of_derivatives_what_the_cpu_learns() {
         assert!((ours / theirs - 1.0).abs() < 0.15, "{name}: last losses {ours} and {theirs}");
         assert!(ours < 0.5 * found[0], "{name}: it learns: {} to {ours}", found[0]);
     }
+}
+
+/// Losses of steps that the CPU takes, and the mean of the parameters.
+fn trained_by_cpu(model: &mut Model, objective: &Objective, samples: &Samples, steps: &[PlannedStep]) -> (Vec<f64>, Average) {
+    let mut average = Average { tables: model.tables(), layers: model.layers() };
+    let mut losses = Vec::new();
+    Fused::new(model, objective, steps[0].count).steps(model, objective, &mut average, |done, loss| {
+        losses.extend(loss);
+        steps.get(done as usize).map(|step| Step::of(step, samples, None, None))
+    });
+    (losses, average)
 }
 
 /// Steps on batches of `count` samples, of which some move the mean of the parameters.
@@ -229,12 +235,7 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let pool = device.upload(&samples, None).unwrap();
     let steps = drawn_steps(count, all);
     let found = device.train_steps(&pool, None, &steps).unwrap();
-    let mut average = Average { tables: model.tables(), layers: model.layers() };
-    let mut expected = Vec::new();
-    Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
-        expected.extend(loss);
-        steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
-    });
+    let (expected, average) = trained_by_cpu(&mut model, &objective, &samples, &steps);
     // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
     assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "{name}: first losses {} and {}", found[0], expected[0]);
     let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;

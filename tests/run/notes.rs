@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicBool;
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// One slide.
-struct Single(Option<Slide>);
+pub(super) struct Single(pub(super) Option<Slide>);
 
 impl Slides for Single {
     fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {

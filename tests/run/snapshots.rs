@@ -1,12 +1,13 @@
 //! What a run says of its snapshots: what every second one is worth to the picture, and that `time.every` leaves the others out.
 
+use super::notes::Single;
 use crate::kit::{
     flow::{quasi_random, trace},
     scene,
 };
 use ridgewatch::field::{DomainPoint, Snapshot, UnitPoint, Window};
 use ridgewatch::flow::{Extras, FlowMap, Precision, Steps, VelocitySource};
-use ridgewatch::run::{Decision, RunError, RunOptions, RunReport, Setup, Slide, Slides};
+use ridgewatch::run::{Decision, RunOptions, RunReport, Setup, Slide};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -78,19 +79,6 @@ fn a_fast_flow_needs_all_snapshots() {
     let decision = told(&report).unwrap();
     let [found, allowed] = stated(decision);
     assert!(decision.chosen == "1" && found > allowed && decision.why.ends_with("all are needed"), "{decision}");
-}
-
-/// One slide.
-struct Single(Option<Slide>);
-
-impl Slides for Single {
-    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {
-        Ok(self.0.take())
-    }
-
-    fn expected(&self) -> Option<u64> {
-        Some(1)
-    }
 }
 
 /// Paths stop there, and would not without the snapshot.
