@@ -1,8 +1,8 @@
 //! The cycle: slide the window, render with the weights of the previous cycle, test, then train.
 //!
 //! One group of threads renders frame n with frozen weights, while another trains the live weights on the samples of earlier frames. A GPU that
-//! trains alternates between picture and training, which takes `training.share` of the device's time while the loss falls. Samples traced for frame n are compared
-//! with the frozen weights, which were not trained on them, before they go to the replay buffer.
+//! trains alternates between picture and training, which takes `training.share` of the device's time while the loss falls. Samples traced for
+//! frame n are compared with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
 use super::budget::FrameCost;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
