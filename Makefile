@@ -6,7 +6,7 @@
 # make test-clients    runs the Python clients of examples/ (notebook widget, tev) beside a run
 # make test-movies     tests films in MP4; installs ffmpeg if apt is available
 # make test-dashboard  tests the dashboard's page in Chromium, with Node.js; installs chromium if apt is available, and the packages of package-lock.json
-# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
+# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, three floods of ten minutes (SECONDS=60: a minute),
 #                      with root also from another user, a Python client that steers, reading a store from far away, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
 # make adapters        builds the C library, the Fortran module and, if pip and the network are available, the Python wheel, into out/adapters
@@ -161,6 +161,10 @@ test-long: packages .venv/installed
 	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-zmtp -- --ignored; else \
 	  echo "NOT RUN: the test that other users are refused, since it needs root"; fi
 	FLOOD_SECONDS="$(or $(SECONDS),600)" $(CARGO) test --release --test publish_flood -- --ignored --nocapture
+	$(CARGO) build --release --bin ridgewatch
+	@if command -v chromium >/dev/null && npm --prefix $(DASHBOARD_TESTS) ci --silent --no-audit --no-fund; then cd $(DASHBOARD_TESTS) && \
+	  PYTHON="$(CURDIR)/.venv/bin/python" RIDGEWATCH=$(CURDIR)/target/release/ridgewatch CHROMIUM=$$(command -v chromium) node figures.js "$(or $(SECONDS),600)" 20; \
+	else echo "NOT RUN: the dashboard's server with many clients, since chromium or its npm packages are missing"; fi
 	$(MAKE) --no-print-directory fuzz
 
 $(CARGO_FUZZ)/bin/cargo-fuzz:

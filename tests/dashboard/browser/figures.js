@@ -1,6 +1,7 @@
 // Measures the dashboard's server and page: `node figures.js [SECONDS] [RATE]`. A publisher sends one real picture of 1280 x 720 pixels again and again with
 // new numbers, so that nothing is rendered meanwhile. One page in Chromium, 20 clients that acknowledge, one that stops reading, and one whose process is
-// stopped without closing its connection. PYTHON names a Python with pyzmq. Prints one line of JSON.
+// stopped without closing its connection. PYTHON names a Python with pyzmq. Prints one line of JSON, and fails if a client lacks a twentieth of the pictures,
+// or the server's memory grows by 8 MiB in the second half.
 import { spawn } from "node:child_process";
 import { readFileSync } from "node:fs";
 import { createInterface } from "node:readline";
@@ -107,4 +108,5 @@ console.log(JSON.stringify({
   clients: { number: CLIENTS, slowest_per_second: round(rates[0]), median_per_second: round(at(rates, 0.5)) },
   memory_mib: { first: round(memory[0]), later_least: round(Math.min(...later)), later_most: round(Math.max(...later)) },
 }));
-process.exit(0);
+const growth = Math.max(...later) - later[0];
+process.exit(rates[0] >= 0.95 * rate && late.length >= 0.95 * seconds * rate && growth < 8 ? 0 : 1);
