@@ -24,7 +24,7 @@ use super::storage::begin_with_half;
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
 use super::until::Refining;
-use super::{ColorBar, RunError, Settings, TransferRecord};
+use super::{ColorBar, RunError, Settings, TransferRecord, snapshots};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
@@ -711,7 +711,9 @@ impl<B: Backend> Cycle<'_, B> {
                     100.0 * change / resolution.ftle_rms
                 ));
             }
-            if let Some(change) = resolution.ftle_change.filter(|change| *change < FINE_IN_TIME * resolution.ftle_rms) {
+            // Where the colours were compared, the decision tells what they lose.
+            let is_told = Decision::is_entered(&self.run.report.decisions, snapshots::SETTING);
+            if let Some(change) = resolution.ftle_change.filter(|change| !is_told && *change < FINE_IN_TIME * resolution.ftle_rms) {
                 sink(Event::Note(format!(
                     "fine in time: without every second snapshot the FTLE changes by {:.2} % of its root mean square; half of the snapshots would do (time.every = {})",
                     100.0 * change / resolution.ftle_rms,

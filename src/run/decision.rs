@@ -31,6 +31,11 @@ impl Decision {
         }
     }
 
+    /// Whether one of the decisions is for this setting.
+    pub(super) fn is_entered(decisions: &[Self], setting: &str) -> bool {
+        decisions.iter().any(|decision| decision.setting == setting)
+    }
+
     /// Removes the decisions for these settings, which a command has given.
     pub(super) fn withdraw(decisions: &mut Vec<Self>, settings: &[&str]) {
         decisions.retain(|decision| !settings.contains(&decision.setting.as_str()));

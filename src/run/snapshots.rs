@@ -10,7 +10,7 @@ use crate::flow::{Precision, StepChoice, VelocitySource};
 use crate::progress::Work;
 use std::sync::Arc;
 
-const SETTING: &str = "time.every";
+pub(super) const SETTING: &str = "time.every";
 /// Snapshots of the smallest window that is asked about: of fewer, hardly any are left.
 const FEWEST: usize = 5;
 
@@ -25,7 +25,7 @@ impl<B: Backend> Cycle<'_, B> {
         let (Some(comparison), VelocitySource::Window(window)) = (&self.compared, &slide.velocity) else { return Ok(()) };
         // Who asks for double precision, or for fewer snapshots, has decided; a command that changes tau asks nothing again.
         let is_open = shown.plan.map.precision == Precision::F32 && shown.plan.scene.time.every == 1;
-        let is_known = self.run.report.decisions.iter().any(|decision| decision.setting == SETTING);
+        let is_known = Decision::is_entered(&self.run.report.decisions, SETTING);
         if !is_open || is_known || slide.index > 0 || window.snapshots().len() < FEWEST {
             return Ok(());
         }

@@ -65,7 +65,7 @@ impl<B: Backend> Cycle<'_, B> {
                 format!("with {} {words}; allowed: {most:.4}", Storage::F16Pairs.name())
             }
             // What was judged before stays.
-            None if self.run.report.decisions.iter().any(|decision| decision.setting == SETTING) => return Ok(false),
+            None if Decision::is_entered(&self.run.report.decisions, SETTING) => return Ok(false),
             None => "too few points show anything to judge half precision by".to_owned(),
         };
         with!(&mut self.session, on => {

@@ -23,7 +23,11 @@ impl Slides for Single {
 }
 
 fn turbulence(keys: &str) -> Setup {
-    let keys = format!("{keys}\nsource.nodes = [24, 12, 12]\ntime.slides = 1\ntime.frames_per_slide = 1\nrender.method = \"reference\"\n");
+    turbulence_by("reference", keys)
+}
+
+fn turbulence_by(method: &str, keys: &str) -> Setup {
+    let keys = format!("{keys}\nsource.nodes = [24, 12, 12]\ntime.slides = 1\ntime.frames_per_slide = 1\nrender.method = \"{method}\"\n");
     scene::setup(&scene::scene("turbulence", [16, 8, 1], &keys), &[])
 }
 
@@ -44,8 +48,11 @@ fn has(notes: &[String], words: &str) -> bool {
 
 #[test]
 fn half_of_the_snapshots_would_do_where_they_change_little() {
-    let slow = notes(turbulence("source.amplitude = 0.2\nsource.snapshots = 61\ntime.tau = 60"));
+    const SLOW: &str = "source.amplitude = 0.2\nsource.snapshots = 61\ntime.tau = 60";
+    let slow = notes(turbulence(SLOW));
     assert!(has(&slow, "fine in time: without every second snapshot the FTLE changes by 0."), "{slow:?}");
+    let compared = notes(turbulence_by("two_level", SLOW));
+    assert!(!has(&compared, "fine in time"), "the decision `time.every` tells what the picture loses: {compared:?}");
     let fast = notes(turbulence("source.amplitude = 3\nsource.snapshots = 9\ntime.tau = 8"));
     assert!(!has(&fast, "fine in time"), "{fast:?}");
 }
