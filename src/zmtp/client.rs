@@ -22,7 +22,9 @@ pub struct Limits {
     pub handshake: Duration,
     /// Time in which a subscriber must take a message, once its first byte is written.
     pub stall: Duration,
-    /// Maximum number of [`Keep::Newest`] messages that are held at a time, see [`crate::PubSocket::has_room`].
+    /// The same for a message of [`Keep::Bulk`].
+    pub bulk_stall: Duration,
+    /// Maximum number of messages of [`Keep::Newest`], and of [`Keep::Bulk`], that are held at a time, see [`crate::PubSocket::has_room`].
     pub in_flight: usize,
     /// Maximum number of [`Keep::All`] messages that wait for one subscriber.
     pub queued: usize,
@@ -40,12 +42,20 @@ impl Default for Limits {
             connections: 256,
             handshake: Duration::from_secs(5),
             stall: Duration::from_secs(2),
+            bulk_stall: Duration::from_secs(10),
             in_flight: 3,
             queued: 256,
             topics: 256,
             topic_bytes: 1 << 14,
             frames: 1000,
         }
+    }
+}
+
+impl Limits {
+    /// Time in which a subscriber must take a message.
+    pub(crate) fn stall_of(&self, keep: Keep) -> Duration {
+        if keep == Keep::Bulk { self.bulk_stall } else { self.stall }
     }
 }
 
@@ -81,8 +91,10 @@ struct Outbox {
     newest: Vec<Arc<Message>>,
     /// Context of the last PING, unless it was answered.
     ping: Option<Vec<u8>>,
-    /// Number of the [`Keep::Newest`] message that is being written, and since when.
-    writing: Option<(u64, Instant)>,
+    /// Kind and number of the message that is being written, and since when.
+    writing: Option<(Keep, u64, Instant)>,
+    /// It has subscribed since a message of [`Keep::Bulk`] was given to it.
+    is_new: bool,
     /// Since when nothing was written to the end.
     idle_since: Instant,
     /// The connection ends when everything is written.
@@ -106,6 +118,7 @@ impl Client {
             newest: Vec::new(),
             ping: None,
             writing: None,
+            is_new: false,
             idle_since: Instant::now(),
             last: false,
         };
@@ -121,9 +134,9 @@ impl Client {
         lock(&self.outbox).idle_since
     }
 
-    /// Number of the [`Keep::Newest`] message that is being written, and since when.
-    pub fn writing(&self) -> Option<(u64, Instant)> {
-        lock(&self.outbox).writing
+    /// Number of the message of this kind that is being written, and since when.
+    pub fn writing(&self, kind: Keep) -> Option<(u64, Instant)> {
+        lock(&self.outbox).writing.filter(|(keep, ..)| *keep == kind).map(|(_, number, since)| (number, since))
     }
 
     /// Ends the connection at once.
@@ -137,16 +150,24 @@ impl Client {
         self.wake.notify_one();
     }
 
-    pub fn wants(&self, topic: &[u8]) -> bool {
-        lock(&self.outbox).wants(topic)
+    /// Whether it subscribes to messages of this topic and kind.
+    pub fn wants(&self, topic: &[u8], keep: Keep) -> bool {
+        lock(&self.outbox).wants(topic, keep)
+    }
+
+    /// Whether it subscribes to a topic of [`Keep::Bulk`], and has subscribed since such a message was given to it.
+    pub fn awaits(&self, topic: &[u8]) -> bool {
+        let outbox = lock(&self.outbox);
+        outbox.is_new && outbox.wants(topic, Keep::Bulk)
     }
 
     /// Gives a message to a subscriber of its topic. Returns whether the oldest message was dropped for it.
     pub fn give(&self, message: &Arc<Message>, queued: usize) -> bool {
         let mut outbox = lock(&self.outbox);
-        if !outbox.wants(&message.topic) {
+        if !outbox.wants(&message.topic, message.keep) {
             return false;
         }
+        outbox.is_new &= message.keep != Keep::Bulk;
         let full = message.keep == Keep::All && outbox.all.len() >= queued;
         match message.keep {
             Keep::All => {
@@ -155,7 +176,7 @@ impl Client {
                 }
                 outbox.all.push_back(Arc::clone(message));
             }
-            Keep::Newest | Keep::Note => {
+            Keep::Newest | Keep::Note | Keep::Bulk => {
                 outbox.newest.retain(|older| older.topic != message.topic);
                 outbox.newest.push(Arc::clone(message));
             }
@@ -180,7 +201,7 @@ impl Client {
             }
             tokio::select! {
                 end = self.read(&mut reader, &mut from, &subscribed) => end,
-                end = self.write(&mut to, limits.stall) => end,
+                end = self.write(&mut to, limits) => end,
             }
         };
         tokio::select! {
@@ -214,9 +235,10 @@ impl Client {
         Ok(())
     }
 
-    async fn write(&self, to: &mut (impl AsyncWrite + Unpin), stall: Duration) -> Result<(), End> {
+    async fn write(&self, to: &mut (impl AsyncWrite + Unpin), limits: &Limits) -> Result<(), End> {
         loop {
             let due = lock(&self.outbox).take();
+            let stall = if let Due::Message(message) = &due { limits.stall_of(message.keep) } else { limits.stall };
             let written = async {
                 match &due {
                     Due::Message(message) => {
@@ -246,15 +268,19 @@ impl Client {
 }
 
 impl Outbox {
-    fn wants(&self, topic: &[u8]) -> bool {
-        self.topics.iter().any(|prefix| topic.starts_with(prefix))
+    fn wants(&self, topic: &[u8], keep: Keep) -> bool {
+        match keep {
+            // Those who subscribe to all topics do not know that they ask for it.
+            Keep::Bulk => self.topics.contains(topic),
+            Keep::Newest | Keep::Note | Keep::All => self.topics.iter().any(|prefix| topic.starts_with(prefix)),
+        }
     }
 
     /// Adds a topic. The same one again changes nothing, as in libzmq.
     fn subscribe(&mut self, topic: Vec<u8>, limits: &Limits) -> Result<(), Fault> {
         let bytes = self.topic_bytes + topic.len();
         if self.topics.insert(topic) {
-            self.topic_bytes = bytes;
+            (self.topic_bytes, self.is_new) = (bytes, true);
         }
         if self.topics.len() > limits.topics || self.topic_bytes > limits.topic_bytes { Err(Fault::Subscriptions) } else { Ok(()) }
     }
@@ -266,7 +292,7 @@ impl Outbox {
             Due::Message(message)
         } else if !self.newest.is_empty() {
             let message = self.newest.remove(0);
-            self.writing = (message.keep == Keep::Newest).then(|| (message.number, Instant::now()));
+            self.writing = Some((message.keep, message.number, Instant::now()));
             Due::Message(message)
         } else if self.last {
             Due::End
@@ -368,7 +394,7 @@ mod tests {
         }
         assert_eq!(taken, [2, 3, 5, 5]);
         drop(outbox);
-        assert!(ledger.wait_below(1, Duration::ZERO));
+        assert!(ledger.wait_below(Keep::Newest, 1, Duration::ZERO));
         // Two of topic b that were held longest, then all that wait, a kilobyte at most.
         assert!((1..1000).contains(&ledger.peak_bytes()));
     }
@@ -380,13 +406,38 @@ mod tests {
         for last in [1, 2] {
             client.give(&ledger.message(&[b"b"], vec![last], Keep::Note), 2);
         }
-        assert!(ledger.wait_below(2, Duration::ZERO), "one message is in flight");
+        assert!(ledger.wait_below(Keep::Newest, 2, Duration::ZERO), "one message is in flight");
         let mut outbox = lock(&client.outbox);
         let Due::Message(picture) = outbox.take() else { panic!("no message") };
-        assert!(picture.last == [0] && outbox.writing.is_some());
+        assert!(picture.last == [0] && outbox.writing.is_some_and(|(keep, ..)| keep == Keep::Newest));
         let Due::Message(note) = outbox.take() else { panic!("no note") };
-        assert!(note.last == [2] && outbox.writing.is_none(), "whoever takes a note slowly holds no place of a picture");
+        assert!(
+            note.last == [2] && outbox.writing.is_some_and(|(keep, ..)| keep == Keep::Note),
+            "whoever takes a note slowly holds no place of a picture"
+        );
         assert!(matches!(outbox.take(), Due::Nothing));
+    }
+
+    #[test]
+    fn bulk_goes_to_those_who_name_its_topic_and_is_counted_for_itself() {
+        let ledger = Arc::new(Ledger::default());
+        let all = subscriber(&["", "lay"]);
+        let named = subscriber(&["layers"]);
+        assert!(!all.awaits(b"layers") && named.awaits(b"layers") && !named.awaits(b"other"));
+        for last in [1, 2] {
+            let message = ledger.message(&[b"layers"], vec![last], Keep::Bulk);
+            assert!(!all.give(&message, 2) && !named.give(&message, 2));
+        }
+        assert!(ledger.wait_below(Keep::Newest, 1, Duration::ZERO) && !ledger.wait_below(Keep::Bulk, 1, Duration::ZERO));
+        assert!(ledger.wait_below(Keep::Bulk, 2, Duration::ZERO), "the second has replaced the first");
+        assert!(!named.awaits(b"layers"));
+        lock(&named.outbox).subscribe(b"other".to_vec(), &Limits::default()).unwrap();
+        assert!(named.awaits(b"layers"), "it has subscribed to something since");
+        assert!(matches!(lock(&all.outbox).take(), Due::Nothing));
+        let Due::Message(message) = lock(&named.outbox).take() else { panic!("no message") };
+        assert!(message.last == [2] && named.writing(Keep::Newest).is_none() && named.writing(Keep::Bulk).is_some());
+        drop(message);
+        assert!(ledger.wait_below(Keep::Bulk, 1, Duration::ZERO));
     }
 
     #[test]

@@ -12,8 +12,22 @@ pub enum Keep {
     Newest,
     /// The next one replaces it. It is small, and does not count among the messages in flight.
     Note,
+    /// As [`Keep::Newest`], for those alone who subscribe to its whole topic. It is large: it counts among its own kind, and its subscriber has
+    /// [`crate::Limits::bulk_stall`] to take it.
+    Bulk,
     /// Both wait, up to [`crate::Limits::queued`] messages; then the oldest is dropped.
     All,
+}
+
+impl Keep {
+    /// Place of its kind among those whose messages in flight are counted.
+    fn in_flight(self) -> Option<usize> {
+        match self {
+            Self::Newest => Some(0),
+            Self::Bulk => Some(1),
+            Self::Note | Self::All => None,
+        }
+    }
 }
 
 /// A message, encoded once for all subscribers.
@@ -22,7 +36,7 @@ pub(crate) struct Message {
     /// First part.
     pub topic: Vec<u8>,
     pub keep: Keep,
-    /// Order in which [`Keep::Newest`] messages were made.
+    /// Order in which messages were made.
     pub number: u64,
     /// All but the bytes of the last part, which may be large and are not copied.
     pub head: Vec<u8>,
@@ -34,7 +48,9 @@ impl Drop for Message {
     fn drop(&mut self) {
         let mut held = lock(&self.ledger.held);
         held.bytes -= self.bytes();
-        held.newest -= usize::from(self.keep == Keep::Newest);
+        if let Some(kind) = self.keep.in_flight() {
+            held.in_flight[kind] -= 1;
+        }
         self.ledger.freed.notify_all();
     }
 }
@@ -75,8 +91,8 @@ pub(crate) struct Ledger {
 struct Held {
     bytes: u64,
     peak_bytes: u64,
-    /// Number of [`Keep::Newest`] messages.
-    newest: usize,
+    /// Number of messages of each kind that is counted.
+    in_flight: [usize; 2],
     made: u64,
 }
 
@@ -94,7 +110,9 @@ impl Ledger {
         let message = Message { topic, keep, number: held.made, head, last, ledger: Arc::clone(self) };
         held.bytes += message.bytes();
         held.peak_bytes = held.peak_bytes.max(held.bytes);
-        held.newest += usize::from(keep == Keep::Newest);
+        if let Some(kind) = keep.in_flight() {
+            held.in_flight[kind] += 1;
+        }
         Arc::new(message)
     }
 
@@ -102,10 +120,11 @@ impl Ledger {
         lock(&self.held).peak_bytes
     }
 
-    /// Whether fewer than `limit` messages of [`Keep::Newest`] are held, after waiting for it.
-    pub fn wait_below(&self, limit: usize, wait: Duration) -> bool {
+    /// Whether fewer than `limit` messages of a kind are held, after waiting for it.
+    pub fn wait_below(&self, keep: Keep, limit: usize, wait: Duration) -> bool {
+        let Some(kind) = keep.in_flight() else { return true };
         let held = lock(&self.held);
-        let waited = self.freed.wait_timeout_while(held, wait, |held| held.newest >= limit);
-        waited.unwrap_or_else(std::sync::PoisonError::into_inner).0.newest < limit
+        let waited = self.freed.wait_timeout_while(held, wait, |held| held.in_flight[kind] >= limit);
+        waited.unwrap_or_else(std::sync::PoisonError::into_inner).0.in_flight[kind] < limit
     }
 }

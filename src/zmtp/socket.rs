@@ -23,7 +23,7 @@ const BATCH: usize = 64;
 const PAUSE: Duration = Duration::from_millis(100);
 /// Longest wait, at the end, for a lookup of users.
 pub(crate) const SHUTDOWN_LIMIT: Duration = Duration::from_millis(100);
-/// Share of [`Limits::stall`] after which a subscriber gives way to one that is ready, if too many messages are in flight.
+/// Share of the time for a message after which a subscriber gives way to one that is ready, if too many messages are in flight.
 const GIVE_WAY: u32 = 8;
 
 /// Counts since the start.
@@ -63,8 +63,6 @@ struct Shared {
     /// A client has left.
     left: Notify,
     counts: Mutex<Counts>,
-    /// Topic of the latest message of [`Keep::Newest`].
-    newest: Mutex<Vec<u8>>,
     ledger: Arc<Ledger>,
 }
 
@@ -76,14 +74,8 @@ impl PubSocket {
     /// An endpoint that is not accepted or in use, or an error of the system.
     pub fn bind(endpoint: &str, peers: Option<Peers>, limits: Limits) -> Result<Self, BindError> {
         let Opened { listener, endpoint, peers, runtime } = Opened::new(endpoint, peers)?;
-        let shared = Arc::new(Shared {
-            limits,
-            clients: Mutex::default(),
-            left: Notify::new(),
-            counts: Mutex::default(),
-            newest: Mutex::default(),
-            ledger: Arc::default(),
-        });
+        let shared =
+            Arc::new(Shared { limits, clients: Mutex::default(), left: Notify::new(), counts: Mutex::default(), ledger: Arc::default() });
         let (close_by, closing) = watch::channel(None);
         let served = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("ridgewatch-zmtp".to_owned()).spawn(move || {
@@ -101,41 +93,43 @@ impl PubSocket {
 
     /// Whether a client subscribes to the topic.
     pub fn is_wanted(&self, topic: &[u8]) -> bool {
-        lock(&self.shared.clients).iter().any(|client| client.wants(topic))
+        lock(&self.shared.clients).iter().any(|client| client.wants(topic, Keep::Newest))
+    }
+
+    /// Whether a client subscribes to this topic of [`Keep::Bulk`]; `Some(true)`: and one has subscribed since such a message was given to it.
+    pub fn wants_bulk(&self, topic: &[u8]) -> Option<bool> {
+        let clients = lock(&self.shared.clients);
+        clients.iter().any(|client| client.wants(topic, Keep::Bulk)).then(|| clients.iter().any(|client| client.awaits(topic)))
     }
 
     /// Sends a message of several parts, of which the first is its topic, to those who subscribe to it. Never waits.
     pub fn send(&self, parts: &[&[u8]], last: Vec<u8>, keep: Keep) {
         let message = self.shared.ledger.message(parts, last, keep);
-        if keep == Keep::Newest {
-            lock(&self.shared.newest).clone_from(&message.topic);
-        }
         let clients = lock(&self.shared.clients).clone();
         let dropped = clients.iter().filter(|client| client.give(&message, self.shared.limits.queued)).count();
         lock(&self.shared.counts).dropped += dropped as u64;
     }
 
-    /// Whether fewer than [`Limits::in_flight`] messages of [`Keep::Newest`] are held, after waiting for it. If subscribers are ready meanwhile, those
-    /// that hold the oldest message for long are disconnected, so that slow ones cost them little.
-    pub fn has_room(&self, wait: Duration) -> bool {
+    /// Whether fewer than [`Limits::in_flight`] messages of this kind, [`Keep::Newest`] or [`Keep::Bulk`], are held, after waiting for it. If subscribers
+    /// of the topic are ready meanwhile, those that hold the oldest message for long are disconnected, so that slow ones cost them little.
+    pub fn has_room(&self, topic: &[u8], keep: Keep, wait: Duration) -> bool {
         let limit = self.shared.limits.in_flight;
-        if self.shared.ledger.wait_below(limit, Duration::ZERO) {
+        if self.shared.ledger.wait_below(keep, limit, Duration::ZERO) {
             return true;
         }
-        let patience = self.shared.limits.stall / GIVE_WAY;
+        let patience = self.shared.limits.stall_of(keep) / GIVE_WAY;
         let clients = lock(&self.shared.clients).clone();
-        let newest = lock(&self.shared.newest).clone();
-        let oldest = clients.iter().filter_map(|client| client.writing()).min();
+        let oldest = clients.iter().filter_map(|client| client.writing(keep)).min();
         if let Some((number, since)) = oldest
             && since.elapsed() >= patience
-            && clients.iter().any(|client| client.wants(&newest) && client.writing().is_none())
+            && clients.iter().any(|client| client.wants(topic, keep) && client.writing(keep).is_none())
         {
-            let holders = clients.iter().filter(|client| client.writing().is_some_and(|(held, _)| held == number));
+            let holders = clients.iter().filter(|client| client.writing(keep).is_some_and(|(held, _)| held == number));
             let closed = holders.map(|client| client.close()).count();
             lock(&self.shared.counts).stalled += closed as u64;
         }
         drop(clients);
-        self.shared.ledger.wait_below(limit, wait)
+        self.shared.ledger.wait_below(keep, limit, wait)
     }
 
     /// Counts so far.

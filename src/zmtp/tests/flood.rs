@@ -20,7 +20,7 @@ fn a_flood_costs_others_nothing() {
     let address = socket.endpoint().strip_prefix("tcp://").unwrap().parse().unwrap();
     let of = Flood { connections: 240, users: &[kit::user()], duration: Duration::from_secs(5) };
     let outcome = kit::flood(address, of, &mut || {
-        if socket.has_room(Duration::ZERO) {
+        if socket.has_room(b"frame", Keep::Newest, Duration::ZERO) {
             socket.send(&[b"frame", b"{}"], vec![7; 512 << 10], Keep::Newest);
         }
         socket.send(&[b"record"], b"{}".to_vec(), Keep::All);

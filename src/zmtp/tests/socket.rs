@@ -206,7 +206,7 @@ fn subscribers_that_do_not_read_cost_others_nothing() {
     let mut healthy = greet(&socket, b"\x00\x02\x01a");
     until("it subscribes", || socket.is_wanted(b"a"));
     let mut send = || {
-        until("there is room", || socket.has_room(Duration::from_millis(10)));
+        until("there is room", || socket.has_room(b"a", Keep::Newest, Duration::from_millis(10)));
         let begin = Instant::now();
         socket.send(&[b"a"], vec![1; BYTES], Keep::Newest);
         assert_eq!((frame(&mut healthy).0, frame(&mut healthy).1.len()), (1, BYTES));
