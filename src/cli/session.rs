@@ -208,6 +208,7 @@ impl Session<'_> {
             messages::note(format_args!("commands at {}, with the key in {}", commands.endpoint(), commands.connection().display()));
         }
         let newest = Arc::new(NewestFrame::of_run(&out, &setup.plan));
+        output.describe(&newest.about());
         let dashboard = page.zip(output.endpoint()).and_then(|(page, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
             let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());

@@ -2,15 +2,51 @@
 
 use super::export::{MapAbout, NewestSlide, NoField, map_netcdf};
 use crate::run::{Frame, Plan};
+use serde::{Deserialize, Serialize};
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Maximum length of the name of a run.
+const MAX_NAME: usize = 100;
+
+/// What is to be known of a run beside its frames.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunAbout {
+    /// Its name in names of files: letters, digits, `-`, `_` and `.`.
+    run: String,
+    /// `None`: unknown.
+    map: Option<MapAbout>,
+}
+
+impl RunAbout {
+    /// Of a run that writes into this folder.
+    pub fn new(folder: &Path, map: MapAbout) -> Self {
+        let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        Self { run: plain(&name), map: Some(map) }
+    }
+
+    /// As another program tells it, in JSON.
+    pub fn told(json: Option<&serde_json::Value>) -> Self {
+        let told = json.and_then(|json| Self::deserialize(json).ok());
+        told.map_or_else(|| Self { run: plain(""), map: None }, |told| Self { run: plain(&told.run), ..told })
+    }
+
+    /// Its name in names of files: letters, digits, `-`, `_` and `.`.
+    pub fn run(&self) -> &str {
+        &self.run
+    }
+}
+
+/// What every file system and a quoted string of HTTP accept.
+fn plain(name: &str) -> String {
+    let plain: String = name.chars().take(MAX_NAME).map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
+    if plain.is_empty() { "run".to_owned() } else { plain }
+}
 
 /// Keeps one frame: the newest. Its picture is shared with those who publish and write it, not copied.
 #[derive(Debug)]
 pub struct NewestFrame {
-    run: String,
-    /// `None`: unknown, of frames that were received.
-    about: Option<MapAbout>,
+    about: Mutex<Arc<RunAbout>>,
     frame: Mutex<Option<Frame>>,
     /// `None` if no slides are kept.
     slide: Option<NewestSlide>,
@@ -38,20 +74,17 @@ impl NewestFrame {
 
     /// The same of frames alone.
     pub fn new(folder: &Path, about: MapAbout) -> Self {
-        let name = folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        // What every file system and a quoted string of HTTP accept.
-        let run: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
-        Self { run: if run.is_empty() { "run".to_owned() } else { run }, about: Some(about), frame: Mutex::default(), slide: None }
+        Self { about: Mutex::new(Arc::new(RunAbout::new(folder, about))), frame: Mutex::default(), slide: None }
     }
 
     /// Of frames that another process publishes, with all their layers.
     pub fn received() -> Self {
-        Self { run: "run".to_owned(), about: None, frame: Mutex::default(), slide: None }
+        Self { about: Mutex::new(Arc::new(RunAbout::told(None))), frame: Mutex::default(), slide: None }
     }
 
-    /// Name of the run in names of files: letters, digits, `-`, `_` and `.`.
-    pub fn run(&self) -> &str {
-        &self.run
+    /// What is known of the run.
+    pub fn about(&self) -> Arc<RunAbout> {
+        Arc::clone(&self.about.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// The pixels of a frame, of a map, as NetCDF by the CF conventions.
@@ -59,8 +92,9 @@ impl NewestFrame {
     /// # Errors
     /// Why it is no such field, or what the system refuses.
     pub fn netcdf(&self, frame: &Frame) -> Result<Vec<u8>, NoField> {
-        let unknown = || NoField::Missing("only the run knows what its coordinates mean: with --dashboard it serves the file".to_owned());
-        map_netcdf(frame, self.about.as_ref().ok_or_else(unknown)?, &self.run)
+        let unknown = || NoField::Missing("the run did not tell what its coordinates mean: with --dashboard it serves the file".to_owned());
+        let about = self.about();
+        map_netcdf(frame, about.map.as_ref().ok_or_else(unknown)?, &about.run)
     }
 
     /// The slide of the newest frame; `None` if no slides are kept.
@@ -71,6 +105,12 @@ impl NewestFrame {
     /// Keeps this frame in place of the one before.
     pub fn put(&self, frame: Frame) {
         self.set(Some(frame));
+    }
+
+    /// Keeps a frame that was received, and what its publisher told of the run.
+    pub fn receive(&self, frame: Frame, about: RunAbout) {
+        *self.about.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(about);
+        self.put(frame);
     }
 
     /// Keeps this frame, or none.
@@ -111,10 +151,20 @@ mod tests {
     }
 
     #[test]
+    fn what_another_program_tells_of_a_run_is_made_plain() {
+        let told = |json: &str| RunAbout::told(Some(&serde_json::from_str(json).unwrap()));
+        assert_eq!(told(r#"{"run": "../a b\"; x", "map": null}"#), RunAbout { run: ".._a_b___x".to_owned(), map: None });
+        assert_eq!(told(&format!(r#"{{"run": "{}"}}"#, "a".repeat(1000))).run().len(), MAX_NAME);
+        assert_eq!(told("3"), RunAbout { run: "run".to_owned(), map: None });
+        let own = RunAbout::new(Path::new("out/gulf"), MapAbout::default());
+        assert_eq!(RunAbout::told(serde_json::to_value(&own).ok().as_ref()), own);
+    }
+
+    #[test]
     fn one_frame_is_kept_and_an_earlier_one_is_freed() {
         let newest = NewestFrame::new(Path::new("out/some run\"1"), MapAbout::default());
-        assert_eq!(newest.run(), "some_run_1");
-        assert_eq!(NewestFrame::new(Path::new(".."), MapAbout::default()).run(), "run");
+        assert_eq!(newest.about().run(), "some_run_1");
+        assert_eq!(RunAbout::new(Path::new(".."), MapAbout::default()).run(), "run");
         assert_eq!(newest.get(None).unwrap_err(), NoFrame::NotYet);
         let ((first, film), (second, _)) = (frame(3), frame(4));
         newest.put(first);

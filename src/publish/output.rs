@@ -3,7 +3,7 @@
 use super::error::PublishError;
 use super::file_writer::FileWriter;
 use super::movie::Movie;
-use super::newest::NewestFrame;
+use super::newest::{NewestFrame, RunAbout};
 use super::run_folder::{RunFolder, SlideMap};
 use super::settings::PublishSettings;
 use super::summary::{Summary, Totals, peak_memory_bytes};
@@ -48,6 +48,13 @@ impl Output {
     pub fn write_to(&mut self, folder: RunFolder, settings: &PublishSettings) -> Result<(), PublishError> {
         self.files = Some(FileWriter::start(folder, settings.clone())?);
         Ok(())
+    }
+
+    /// Tells those who get all layers what is to be known of the run.
+    pub fn describe(&self, about: &RunAbout) {
+        if let Some(publisher) = &self.publisher {
+            publisher.describe(about);
+        }
     }
 
     /// Keeps the newest frame in memory from now on.

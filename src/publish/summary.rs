@@ -82,6 +82,8 @@ pub struct PublishStatistics {
     pub without_subscriber: u64,
     /// Pictures that could not be encoded or sent.
     pub failed: u64,
+    /// Messages with all layers of a frame given to subscribers.
+    pub layers: u64,
     /// Records given to subscribers, or without one.
     pub records: u64,
     /// Records dropped because too many waited, once for each subscriber.

@@ -7,6 +7,7 @@ use crate::cf::units::Unit;
 use crate::formats::{Attribute, DataFile, Variable};
 use crate::grids::{AxisPlan, Layout, Quantity, REFERENCE_PRESSURE, Resampling, SCALE_HEIGHT};
 use ridgewatch_field::EARTH_RADIUS;
+use serde::{Deserialize, Deserializer, Serialize};
 
 /// Grid mappings of the CF conventions, appendix F.
 const MAPPINGS: [&str; 16] = [
@@ -28,21 +29,26 @@ const MAPPINGS: [&str; 16] = [
     "vertical_perspective",
 ];
 
-/// What a source's coordinates are called and mean. Empty for sources without files.
-#[derive(Debug, Clone, Default, PartialEq)]
+/// One of the words that are known here. (By this name serde does not take it for a part of what it reads.)
+type Word = &'static str;
+
+/// What a source's coordinates are called and mean. Empty for sources without files. Told to others, it has no positions, which are as many as nodes.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Georeference {
     /// x, y and, in three dimensions, z.
     pub axes: Vec<Coordinate>,
     /// Where the horizontal coordinates lie on the globe.
     pub mapping: Option<GridMapping>,
     /// Longitudes and latitudes of a grid whose axes are neither.
+    #[serde(skip)]
     pub positions: Option<Positions>,
     /// Name of the calendar in which times are seconds since 1970-01-01. `None` if times are no dates.
-    pub calendar: Option<&'static str>,
+    #[serde(deserialize_with = "calendar")]
+    pub calendar: Option<Word>,
 }
 
 /// A coordinate variable of the source.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Coordinate {
     /// Name in the file.
     pub name: String,
@@ -53,11 +59,12 @@ pub struct Coordinate {
     /// Long name, if the file has one.
     pub long_name: Option<String>,
     /// `up` or `down`, of levels.
-    pub positive: Option<&'static str>,
+    #[serde(deserialize_with = "positive")]
+    pub positive: Option<Word>,
     conversion: Conversion,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 enum Conversion {
     /// Factor from the grid's coordinate to the source's.
     Linear(f64),
@@ -66,7 +73,7 @@ enum Conversion {
 }
 
 /// A grid mapping variable.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GridMapping {
     /// Name of the variable.
     pub name: String,
@@ -75,7 +82,8 @@ pub struct GridMapping {
 }
 
 /// Value of an attribute of a grid mapping.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
 pub enum MappingValue {
     /// Text.
     Text(String),
@@ -92,6 +100,17 @@ pub struct Positions {
     y: Vec<f64>,
     /// Longitude and latitude, x fastest.
     pub(crate) degrees: Vec<[f64; 2]>,
+}
+
+/// A calendar that is known; `None` for others.
+fn calendar<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Word>, D::Error> {
+    Ok(Option::<String>::deserialize(deserializer)?.and_then(|name| Calendar::parse(&name)).map(Calendar::name))
+}
+
+/// A direction that is known; `None` for others.
+fn positive<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Word>, D::Error> {
+    let told = Option::<String>::deserialize(deserializer)?;
+    Ok(["up", "down"].into_iter().find(|known| told.as_deref() == Some(*known)))
 }
 
 impl Coordinate {

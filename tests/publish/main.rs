@@ -4,4 +4,5 @@
 mod full_disk;
 #[path = "../kit/mod.rs"]
 mod kit;
+mod layers;
 mod socket;

@@ -7,6 +7,7 @@ use crate::flow::Direction;
 use crate::render::{Camera, Method};
 use crate::run::{Frame, FrameRecord, Plan};
 use crate::source::{Georeference, utc};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Why there is no file of a frame's pixels, or of a slide's field.
@@ -27,7 +28,7 @@ pub enum NoField {
 }
 
 /// What is to be known of a run for the files of its maps.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct MapAbout {
     title: String,
     georeference: Georeference,
@@ -107,6 +108,11 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
     if record.method != Method::Map.name() {
         let found = format!("a frame of {} is a picture of a volume, which shows no FTLE below transfer.low", record.method);
         return Err(NoField::Missing(found));
+    }
+    // Another program may have sent it.
+    let pixels = film.width.saturating_mul(film.height);
+    if record.size != [film.width, film.height] || [&film.ftle_mean, &film.error, &film.missing].iter().any(|layer| layer.len() != pixels) {
+        return Err(NoField::Missing("the frame lacks the FTLE, its error or the missing share of some pixels".into()));
     }
     let centres = Centres::of(record).map_err(|why| NoField::Missing(format!("the frame is no field on axes: {why}")))?;
     let ([min_x, min_y], [max_x, max_y]) = (centres.first, centres.last);
