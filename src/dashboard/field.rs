@@ -1,7 +1,7 @@
 //! The FTLE field of the slide that the run shows, as a file. It is traced beside the run, on few threads, one at a time for all pages.
 
 use super::access::parameter;
-use super::pixels::{NOT_SENT, Pixels, Refusal, Sent, no_field, refused, whole};
+use super::pixels::{NO_WINDOW, Pixels, Refusal, Sent, no_field, refused, whole};
 use crate::publish::{NewestFrame, SlideField};
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
 use axum::http::{StatusCode, Uri};
@@ -56,7 +56,7 @@ impl Fields {
     /// # Errors
     /// The slide is not kept, or the field of another one is being traced.
     fn of(self: &Arc<Self>, slide: Option<u64>, newest: &Arc<NewestFrame>) -> Result<Option<Arc<Job>>, Refusal> {
-        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, NOT_SENT.to_owned()))?;
+        let slides = newest.slide().ok_or((StatusCode::NOT_FOUND, NO_WINDOW.to_owned()))?;
         let shown = slides.index();
         let mut kept = self.lock();
         match &*kept {
@@ -76,7 +76,7 @@ impl Fields {
         let [done, all] = [0, 0].map(AtomicUsize::new);
         let job = Arc::new(Job { slide: field.index(), began: now, done, all, asked: Mutex::new(now), made: Mutex::default() });
         *kept = Some(Arc::clone(&job));
-        tokio::spawn(Arc::clone(self).make(Arc::clone(&job), field, newest.run().to_owned()));
+        tokio::spawn(Arc::clone(self).make(Arc::clone(&job), field, newest.about().run().to_owned()));
         Ok(Some(job))
     }
 
@@ -139,7 +139,7 @@ impl Pixels {
         if made.is_err() {
             self.fields.lock().take_if(|kept| Arc::ptr_eq(kept, &job));
         }
-        let name = format!("{}-field-slide-{:04}.nc", newest.run(), job.slide);
+        let name = format!("{}-field-slide-{:04}.nc", newest.about().run(), job.slide);
         let bytes = made.map_err(|(status, why)| (status, format!("{name} cannot be made: {why}")))?;
         let head = [(CONTENT_TYPE, "application/netcdf".to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))];
         Ok((head, Bytes::from_owner(Sent::new(bytes, place))).into_response())

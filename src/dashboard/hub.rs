@@ -166,7 +166,7 @@ struct State<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     problem: Option<String>,
     steering: Reach,
-    values: Kept<'a>,
+    values: Kept,
     /// Whether there is a chart of speed against accuracy.
     has_chart: bool,
     /// Token that only watches, for pages that may steer.
@@ -179,6 +179,8 @@ struct State<'a> {
 struct Head {
     encoding: String,
     payload_bytes: usize,
+    /// Rows, columns and channels.
+    shape: Option<[usize; 3]>,
 }
 
 impl Hub {
@@ -298,7 +300,7 @@ impl Hub {
 
     async fn take_picture(&self, given: &Bytes, picture: &Bytes) -> Result<(), String> {
         let header = understood(given)?;
-        let (_, Head { encoding, payload_bytes }) = checked(header.as_bytes())?;
+        let (_, Head { encoding, payload_bytes, shape }) = checked(header.as_bytes())?;
         if !["jpeg", "png", "exr"].contains(&encoding.as_str()) {
             return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg, png and exr (publish.payload)"));
         }
@@ -306,15 +308,25 @@ impl Hub {
             return Err(format!("a picture of {} bytes, of which its header says {payload_bytes}", picture.len()));
         }
         if encoding != "exr" {
-            self.pixels.receive(None);
+            self.pixels.receive_plain(shape.map_or(0, |[rows, columns, _]| rows.saturating_mul(columns)));
             return self.show(header, picture);
         }
         let (given, picture) = (given.clone(), picture.clone());
         let decoded = tokio::task::spawn_blocking(move || decode(&given, &picture)).await.map_err(|error| error.to_string())?;
-        let Received { header, jpeg, frame } = decoded?;
+        let Received { header, jpeg, frame, about } = decoded?;
         self.show(&header, &jpeg)?;
-        self.pixels.receive(Some(frame));
+        self.pixels.receive(frame, about);
         Ok(())
+    }
+
+    /// Tells pages of a problem, until the next picture is shown.
+    pub(super) fn complain(&self, problem: &str) {
+        lock(&self.health).problem = Some(short(problem));
+    }
+
+    /// Where the run publishes.
+    pub(super) fn endpoint(&self) -> &str {
+        &self.endpoint
     }
 
     /// Shows a picture that browsers know.
@@ -461,7 +473,7 @@ pub(super) fn checked<'a, T: Deserialize<'a>>(json: &'a [u8]) -> Result<(&'a str
 }
 
 /// JSON that says to be of the protocol that is spoken here.
-fn understood(json: &[u8]) -> Result<&str, String> {
+pub(super) fn understood(json: &[u8]) -> Result<&str, String> {
     #[derive(Deserialize)]
     struct Protocol {
         protocol: u32,

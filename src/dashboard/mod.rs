@@ -12,6 +12,7 @@ mod error;
 mod field;
 mod files;
 mod hub;
+mod layers;
 mod metrics;
 mod pixels;
 mod planes;
@@ -59,8 +60,8 @@ pub struct DashboardSettings {
     pub token: Token,
     /// Connection file of the run's command socket; `None`: pages only watch.
     pub steer: Option<PathBuf>,
-    /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own, which serves those that are
-    /// published with all layers.
+    /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own, which asks the publisher for all
+    /// layers while a page needs them.
     pub newest: Option<Arc<NewestFrame>>,
     /// Chart of speed against accuracy, as SVG.
     pub chart: Option<Vec<u8>>,
@@ -114,6 +115,7 @@ impl Dashboard {
                     // Its sender is dropped.
                     _ = stopped => {}
                     () = hub.follow() => {}
+                    () = hub.follow_layers(), if !is_beside_run => {}
                     () = hub.wheel.drive(requests) => {}
                     () = server::serve(listener, access, Arc::clone(&hub)) => {}
                 }

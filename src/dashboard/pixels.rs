@@ -1,9 +1,10 @@
-//! Pixels of the newest frame of the run in this process, and that frame as a file.
+//! Pixels of the newest frame, of the run in this process or as another one publishes its layers, and that frame as a file.
 
 use super::access::parameter;
 use super::field::Fields;
+use super::layers::Layers;
 use super::planes::MAX_PLANES;
-use crate::publish::{NewestFrame, NoField, NoFrame, channels_at, encode_exr, no_error, png};
+use crate::publish::{MAX_LAYERED_PIXELS, NewestFrame, NoField, NoFrame, RunAbout, channels_at, encode_exr, no_error, png};
 use crate::render::Film;
 use crate::run::Frame;
 use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
@@ -12,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use serde::Serialize;
 use serde_json::{Map, Value};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
 
@@ -22,26 +24,37 @@ const MAX_DOWNLOADS: usize = 1;
 /// Lossless pictures on their way at once, most of them the same one.
 const MAX_PICTURES: usize = 64;
 
-pub(super) const ELSEWHERE: &str = "only a run with --dashboard, or publish.payload = \"exr\", has them";
-/// Of what is never sent.
-pub(super) const NOT_SENT: &str = "only a run with --dashboard has it";
+/// Of a picture that is published without its layers. A test holds the number to the publisher's.
+const TOO_LARGE: &str = "the run publishes layers of pictures of up to 4194304 pixels; with --dashboard it serves those of larger ones";
+/// Of layers that were asked for.
+const NOT_REACHED: &str = "the run is not reached";
+const NOT_COME: &str = "the layers of its newest frame have not come: try again (a run of an earlier version sends none)";
+/// Of what is not sent.
+pub(super) const NO_WINDOW: &str = "only a run with --dashboard has it, since it is traced in the run's window";
+pub(super) const NO_CELLS: &str = "the run did not send its trusted cells: with --dashboard it has them";
 
 /// What is served of the pixels, as a page is told.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Kept<'a> {
-    /// The newest frame, of the run of this name.
-    Ready(&'a str),
+pub(super) enum Kept {
+    /// The newest frame, of the run of this name, or layers that come when they are asked for.
+    Ready(String),
     /// Why nothing is.
     None(&'static str),
 }
 
-/// Serves the newest frame: of the run in this process, or as it was received with all layers.
+/// Serves the newest frame: of the run in this process, or as it is received with all layers.
 #[derive(Debug)]
 pub(super) struct Pixels {
     pub(super) newest: Arc<NewestFrame>,
     /// The run is another process.
     pub(super) is_beside: bool,
+    /// Of a run in another process.
+    pub(super) layers: Layers,
+    /// Its pictures are published with all layers.
+    are_whole: AtomicBool,
+    /// Pixels of its newest picture that was published without.
+    pixels: AtomicUsize,
     pub(super) downloads: Arc<Semaphore>,
     /// The latest picture that was encoded without loss, for all pages that ask for it.
     lossless: Mutex<Option<(Weak<Film>, Bytes)>>,
@@ -113,28 +126,74 @@ impl Pixels {
         let [downloads, pictures, planes] = [MAX_DOWNLOADS, MAX_PICTURES, MAX_PLANES].map(|most| Arc::new(Semaphore::new(most)));
         let is_beside = newest.is_none();
         let newest = newest.unwrap_or_else(|| Arc::new(NewestFrame::received()));
-        Self { newest, is_beside, downloads, lossless: Mutex::default(), pictures, planes, fields: Arc::default() }
-    }
-
-    pub fn kept(&self) -> Kept<'_> {
-        if self.is_beside && self.newest.get(None).is_err() { Kept::None(ELSEWHERE) } else { Kept::Ready(self.newest.run()) }
-    }
-
-    /// Takes a frame of a run in another process, or that it came without its layers.
-    pub fn receive(&self, frame: Option<Frame>) {
-        if self.is_beside {
-            self.newest.set(frame);
+        Self {
+            newest,
+            is_beside,
+            layers: Layers::default(),
+            are_whole: AtomicBool::new(false),
+            pixels: AtomicUsize::new(0),
+            downloads,
+            lossless: Mutex::default(),
+            pictures,
+            planes,
+            fields: Arc::default(),
         }
     }
 
-    /// The frame that a query asks for by its number, or the newest one, and the name of its run.
-    pub(super) fn frame(&self, uri: &Uri) -> Result<(Frame, &str), Refusal> {
+    pub fn kept(&self) -> Kept {
+        if self.is_too_large() { Kept::None(TOO_LARGE) } else { Kept::Ready(self.newest.about().run().to_owned()) }
+    }
+
+    /// Takes a frame of a run in another process that is published with all layers.
+    pub fn receive(&self, frame: Frame, about: RunAbout) {
+        if self.is_beside {
+            self.are_whole.store(true, Ordering::Relaxed);
+            self.newest.receive(frame, about);
+        }
+    }
+
+    /// A picture of a run in another process came, of so many pixels and without its layers.
+    pub fn receive_plain(&self, pixels: usize) {
+        self.pixels.store(pixels, Ordering::Relaxed);
+        // One before may have been of another run.
+        if self.are_whole.swap(false, Ordering::Relaxed) {
+            self.forget_layers();
+        }
+    }
+
+    /// Gives up layers that were asked for.
+    pub(super) fn forget_layers(&self) {
+        if self.is_beside && !self.are_whole.load(Ordering::Relaxed) {
+            self.newest.set(None);
+        }
+    }
+
+    fn is_too_large(&self) -> bool {
+        self.is_beside && !self.are_whole.load(Ordering::Relaxed) && self.pixels.load(Ordering::Relaxed) > MAX_LAYERED_PIXELS
+    }
+
+    /// As [`Self::frame`]; a run in another process is asked for its layers first, and they are waited for.
+    pub(super) async fn needed_frame(&self, uri: &Uri) -> Result<(Frame, Arc<RunAbout>), Refusal> {
+        if self.is_beside && !self.are_whole.load(Ordering::Relaxed) && !self.is_too_large() {
+            self.layers.need().await;
+        }
+        self.frame(uri)
+    }
+
+    /// The frame that a query asks for by its number, or the newest one, and what is known of its run.
+    pub(super) fn frame(&self, uri: &Uri) -> Result<(Frame, Arc<RunAbout>), Refusal> {
         let wanted =
             parameter(uri, "frame").map(|text| whole("frame", text, "the number of a frame, or none for the newest")).transpose()?;
         match self.newest.get(wanted) {
-            Ok(frame) => Ok((frame, self.newest.run())),
-            Err(NoFrame::NotYet) if self.is_beside => Err((StatusCode::NOT_FOUND, ELSEWHERE.to_owned())),
+            Ok(frame) => Ok((frame, self.newest.about())),
+            Err(NoFrame::NotYet) if self.is_too_large() => Err((StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE.to_owned())),
+            Err(NoFrame::NotYet) if self.is_beside => {
+                Err((StatusCode::NOT_FOUND, (if self.layers.are_lost() { NOT_REACHED } else { NOT_COME }).to_owned()))
+            }
             Err(NoFrame::NotYet) => Err((StatusCode::NOT_FOUND, "no frame is complete yet".to_owned())),
+            Err(NoFrame::MovedOn { wanted, kept }) if self.is_beside => {
+                Err((StatusCode::GONE, format!("frame {wanted} is not kept here: the newest whose layers came is {kept}")))
+            }
             Err(NoFrame::MovedOn { wanted, kept }) => {
                 Err((StatusCode::GONE, format!("frame {wanted} is no longer kept: the run keeps its newest one, {kept} by now")))
             }
@@ -142,11 +201,11 @@ impl Pixels {
     }
 
     /// Answers with all that is known of a pixel: the channels of the frame's EXR there, as JSON.
-    pub fn values(&self, uri: &Uri) -> Response {
-        self.values_at(uri).map_or_else(refused, |json| ([(CONTENT_TYPE, "application/json")], json).into_response())
+    pub async fn values(&self, uri: &Uri) -> Response {
+        self.values_at(uri).await.map_or_else(refused, |json| ([(CONTENT_TYPE, "application/json")], json).into_response())
     }
 
-    fn values_at(&self, uri: &Uri) -> Result<String, Refusal> {
+    async fn values_at(&self, uri: &Uri) -> Result<String, Refusal> {
         #[derive(Serialize)]
         struct Values<'a> {
             frame: u64,
@@ -164,7 +223,7 @@ impl Pixels {
             #[serde(skip_serializing_if = "Option::is_none")]
             no_error: Option<String>,
         }
-        let (frame, _) = self.frame(uri)?;
+        let (frame, _) = self.needed_frame(uri).await?;
         let no_error = no_error(&frame);
         let Frame { film, record, color_bar, .. } = frame;
         let at = |name: &str, end: usize| {
@@ -209,10 +268,16 @@ impl Pixels {
         let busy = |_| (StatusCode::SERVICE_UNAVAILABLE, "another file is on its way: try again when it has arrived".to_owned());
         let permits = if matches!(file, File::Png) { &self.pictures } else { &self.downloads };
         let permit = Arc::clone(permits).try_acquire_owned().map_err(busy)?;
-        let (frame, run) = match self.frame(uri) {
-            // A page that only wants a nicer picture is not told of an error, which browsers put on their console.
-            Err((StatusCode::GONE, _)) if parameter(uri, "if") == Some("newest") => return Ok(StatusCode::NO_CONTENT.into_response()),
-            found => found?,
+        let (frame, about) = if parameter(uri, "if") == Some("newest") {
+            match self.frame(uri) {
+                // A page that only wants a nicer picture asks for no layers, and is not told of an error, which browsers put on their console.
+                Err((StatusCode::GONE | StatusCode::NOT_FOUND | StatusCode::PAYLOAD_TOO_LARGE, _)) => {
+                    return Ok(StatusCode::NO_CONTENT.into_response());
+                }
+                found => found?,
+            }
+        } else {
+            self.needed_frame(uri).await?
         };
         let pixels = frame.film.width * frame.film.height;
         if pixels > MAX_PIXELS {
@@ -220,7 +285,7 @@ impl Pixels {
             return Err((StatusCode::PAYLOAD_TOO_LARGE, found));
         }
         let (ending, media_type) = file.form();
-        let name = format!("{run}-frame-{:06}-slide-{:04}.{ending}", frame.record.frame, frame.record.slide);
+        let name = format!("{}-frame-{:06}-slide-{:04}.{ending}", about.run(), frame.record.frame, frame.record.slide);
         let failed = |(status, error): Refusal| (status, format!("{name} cannot be made: {error}"));
         let bytes = match file {
             File::Png => self.lossless(&frame).await,

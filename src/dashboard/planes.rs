@@ -2,7 +2,7 @@
 
 use super::access::parameter;
 use super::hub::message;
-use super::pixels::{NOT_SENT, Pixels, Refusal, Sent, bad, refused};
+use super::pixels::{NO_CELLS, Pixels, Refusal, Sent, bad, refused};
 use crate::publish::{Layer, histogram, plane};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::{StatusCode, Uri};
@@ -24,8 +24,8 @@ impl Pixels {
     }
 
     /// Answers with how often the frame shows each FTLE, as JSON.
-    pub fn histogram(&self, uri: &Uri) -> Response {
-        let counted = self.frame(uri).and_then(|(frame, _)| {
+    pub async fn histogram(&self, uri: &Uri) -> Response {
+        let counted = self.needed_frame(uri).await.and_then(|(frame, _)| {
             serde_json::to_string(&histogram(&frame)).map_err(|error| (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()))
         });
         counted.map_or_else(refused, |json| ([(CONTENT_TYPE, "application/json")], json).into_response())
@@ -34,10 +34,10 @@ impl Pixels {
     async fn encoded_plane(&self, uri: &Uri) -> Result<Response, Refusal> {
         let name = parameter(uri, "of").unwrap_or_default();
         let layer = Layer::named(name).ok_or_else(|| bad("of", name, Layer::NAMES))?;
-        // What cannot be met does not wait.
-        let (frame, _) = self.frame(uri)?;
-        if layer == Layer::Trusted && frame.gate.is_none() && self.is_beside {
-            return Err((StatusCode::NOT_FOUND, NOT_SENT.to_owned()));
+        // What cannot be met does not wait for a place.
+        let (frame, _) = self.needed_frame(uri).await?;
+        if layer == Layer::Trusted && frame.gate.is_none() && self.is_beside && frame.record.surrogate.is_some() {
+            return Err((StatusCode::NOT_FOUND, NO_CELLS.to_owned()));
         }
         let busy = || (StatusCode::SERVICE_UNAVAILABLE, "other planes are on their way: try again in some seconds".to_owned());
         let permit = timeout(PLANE_WAIT, Arc::clone(&self.planes).acquire_owned()).await.map_err(|_| busy())?.map_err(|_| busy())?;

@@ -183,8 +183,8 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
             OfFrames::Field => hub.pixels.field(&parts.uri),
             OfFrames::File(file) => hub.pixels.download(file, &parts.uri).await,
             OfFrames::Plane => hub.pixels.plane(&parts.uri).await,
-            OfFrames::Histogram => hub.pixels.histogram(&parts.uri),
-            OfFrames::Values => hub.pixels.values(&parts.uri),
+            OfFrames::Histogram => hub.pixels.histogram(&parts.uri).await,
+            OfFrames::Values => hub.pixels.values(&parts.uri).await,
         });
     }
     Ok(match files::named(path) {

@@ -3,6 +3,7 @@
 
 #[path = "../kit/mod.rs"]
 mod kit;
+mod layers;
 mod metrics;
 mod planes;
 mod program;

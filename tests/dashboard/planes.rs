@@ -67,7 +67,7 @@ fn a_plane_has_the_layer_of_the_film() {
     }
     let alone = Stage::new();
     let (status, answer) = get(alone.address(), &format!("/plane?of=ftle&token={}", alone.token), &[]);
-    assert!(status == 404 && answer.contains("only a run with --dashboard, or publish.payload"), "{answer}");
+    assert!(status == 404 && answer.contains("the run is not reached"), "{answer}");
 }
 
 #[test]

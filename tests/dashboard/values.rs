@@ -17,7 +17,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// A film whose pixels all differ, with an error a pixel or without.
 pub fn film([width, height]: [usize; 2], has_error: bool) -> Film {
@@ -39,7 +39,11 @@ pub fn frame(number: u64, film: Film) -> Frame {
 pub fn stage(frame: Option<Frame>) -> (Stage, Arc<NewestFrame>) {
     let newest = Arc::new(NewestFrame::new(Path::new("out/gulf"), MapAbout::default()));
     frame.into_iter().for_each(|frame| newest.put(frame));
-    (Stage::with(tempfile::tempdir().unwrap(), None, Some(Arc::clone(&newest))), newest)
+    (stage_of(Arc::clone(&newest)), newest)
+}
+
+pub fn stage_of(newest: Arc<NewestFrame>) -> Stage {
+    Stage::with(tempfile::tempdir().unwrap(), None, Some(newest))
 }
 
 pub fn body(answer: &str) -> &str {
@@ -58,7 +62,7 @@ pub fn bytes(address: SocketAddr, target: &str) -> (String, Vec<u8>) {
 }
 
 /// The channels of a JSON answer are those of the film at that pixel, to the last bit.
-fn agrees(values: &Value, film: &Film) {
+pub fn agrees(values: &Value, film: &Film) {
     let pixel = [values["x"].as_u64().unwrap() as usize, values["y"].as_u64().unwrap() as usize];
     let expected = channels_at(film, pixel);
     assert_eq!(values["channels"].as_object().unwrap().len(), expected.len(), "{values}");
@@ -126,12 +130,10 @@ fn what_cannot_be_told_is_said_in_words() {
     let values: Value = serde_json::from_str(body(&answer)).unwrap();
     assert!(status == 200 && values["channels"].get("error").is_none());
     assert_eq!(values["no_error"], "gated states no error of a pixel; map, marched and two_level do");
-    // A process of its own has no frames, and its pages know before they ask.
-    let alone = Stage::new();
-    let state = alone.visit().until_state(|_| true);
-    assert!(state["values"]["none"].as_str().unwrap().contains("only a run with --dashboard"), "{state}");
+    // A process of its own has no frames, and does not wait for those of a run that is not there.
+    let (alone, begin) = (Stage::new(), Instant::now());
     let (status, answer) = get(alone.address(), &format!("/values?x=0&y=0&token={}", alone.token), &[]);
-    assert!(status == 404 && answer.contains("only a run with --dashboard"), "{answer}");
+    assert!(status == 404 && answer.contains("the run is not reached") && begin.elapsed() < Duration::from_secs(3), "{answer}");
     assert_eq!(stage.visit().until_state(|_| true)["values"], json!({"ready": "gulf"}));
 }
 
@@ -139,6 +141,11 @@ fn what_cannot_be_told_is_said_in_words() {
 fn above(x: f64, y: f64, half_width: f64) -> CameraSettings {
     let (eye, look_at) = ([x, y, 0.2 + half_width], [x, y, 0.2]);
     CameraSettings { eye, look_at, up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true }
+}
+
+/// A map of [0, 2] x [0, 1], seen from straight above.
+pub fn map_frame_above(number: u64, size: [usize; 2]) -> Frame {
+    map_frame(number, size, above(1.0, 0.5, 1.0))
 }
 
 /// A map of [0, 2] x [0, 1].
@@ -216,8 +223,9 @@ fn frames_that_are_published_with_all_layers_are_served() {
     let mut visitor = stage.visit();
     let publisher = raw_publisher(&stage, &mut visitor);
     let (status, answer) = get(address, &format!("/values?x=0&y=0&token={token}"), &[]);
-    assert!(status == 404 && answer.contains("only a run with --dashboard, or publish.payload = \"exr\", has them"), "{answer}");
+    assert!(status == 404 && answer.contains("the layers of its newest frame have not come"), "{answer}");
     let sent = frame(12, film([9, 4], true));
+    let sent = Frame { record: Arc::new(FrameRecord { surrogate: Some("table".into()), ..(*sent.record).clone() }), ..sent };
     let exr = encode_exr(&sent.film, Some(&sent.record)).unwrap();
     let header = FrameHeader {
         protocol: 3,
@@ -229,6 +237,8 @@ fn frames_that_are_published_with_all_layers_are_served() {
         tone_map: sent.tone_map,
         color_bar: sent.color_bar.as_deref().cloned(),
         record: (*sent.record).clone(),
+        trusted: None,
+        about: None,
     };
     let publish = |header: &FrameHeader, picture: &[u8]| {
         let json = serde_json::to_vec(header).unwrap();
@@ -253,12 +263,13 @@ fn frames_that_are_published_with_all_layers_are_served() {
         let bits = |film: &Film| channels_at(film, pixel).into_iter().map(|(name, value)| (name, value.to_bits())).collect::<Vec<_>>();
         assert_eq!(bits(&saved), bits(&sent.film), "{pixel:?}");
     }
+    // As an earlier version sends it, which told less.
     for (target, status, words) in [
         ("/plane?of=error&", 200, ""),
         ("/histogram?", 200, "counts"),
-        ("/plane?of=trusted&", 404, "only a run with --dashboard has it"),
+        ("/plane?of=trusted&", 404, "the run did not send its trusted cells"),
         ("/field.nc?", 404, "only a run with --dashboard has it"),
-        ("/frame.nc?", 404, "only the run knows"),
+        ("/frame.nc?", 404, "the run did not tell what its coordinates mean"),
     ] {
         let (found, answer) = get(address, &format!("{target}token={token}"), &[]);
         assert!(found == status && answer.contains(words), "{target} {answer}");
@@ -284,8 +295,13 @@ fn frames_that_are_published_with_all_layers_are_served() {
     let plain = FrameHeader { encoding: Payload::Jpeg, payload_bytes: 3, ..header.clone() };
     publish(&plain, b"abc");
     assert_eq!(visitor.frame().payload, b"abc");
-    visitor.until_state(|state| state["values"]["none"].is_string());
-    assert_eq!(get(address, &format!("/frame.exr?token={token}"), &[]).0, 404);
+    until("they are given up", || get(address, &format!("/frame.png?if=newest&token={token}"), &[]).0 == 204);
+    // Nor would it of a picture as large as this.
+    publish(&FrameHeader { shape: [2049, 2048, 3], ..plain }, b"abc");
+    visitor.until_state(|state| state["values"]["none"].as_str().is_some_and(|why| why.contains("up to 4194304 pixels")));
+    let (status, answer) = get(address, &format!("/frame.exr?token={token}"), &[]);
+    assert!(status == 413 && answer.contains("up to 4194304 pixels"), "{answer}");
+    assert_eq!(ridgewatch::publish::MAX_LAYERED_PIXELS, 4_194_304);
 }
 
 #[test]

@@ -5,6 +5,8 @@ import { count, number } from "./words.js";
 
 // Between two planes, so that they leave room for pictures.
 const SPACING = 100;
+// The same where that of a later frame is on its way.
+const LATER = 1000;
 const COLOURS = Array.from({ length: 64 }, (_, k) => viridis(k / 63));
 
 // What each layer is called, and its range of colours; `zero` tells whether 0 is drawn.
@@ -30,8 +32,10 @@ export class Overlay {
     this.of = "none";
     this.frame = null;
     this.gone = false;
+    this.newest = null;
     this.busy = false;
     this.due = false;
+    this.pause = null;
   }
 
   receiveState({ values }) {
@@ -43,7 +47,15 @@ export class Overlay {
   choose(of) {
     this.of = of;
     this.clear();
+    // Another layer is not waited for.
+    if (this.pause !== null) this.go();
     this.changed();
+  }
+
+  /** Ends the pause after a plane. */
+  go() {
+    clearTimeout(this.pause);
+    [this.pause, this.busy] = [null, false];
   }
 
   /** The layer after this one, of those that a select has. */
@@ -55,6 +67,7 @@ export class Overlay {
   /** Another picture is shown: of the frame that is looked back at, `held` (null: the newest is followed). `newest` is the number of the newest. */
   look(held, newest) {
     this.frame = held;
+    this.newest = newest;
     this.gone = held !== null && newest !== null && held !== newest;
     this.changed();
   }
@@ -100,7 +113,10 @@ export class Overlay {
       if (plane && !plane.none) this.draw(plane);
       else this.clear(`No overlay: ${problem ?? plane.none}`);
     }
-    setTimeout(() => { this.busy = false; this.next(); }, SPACING);
+    // A server apart from the run gets its layers about once a second.
+    const isLate = frame === null && plane?.frame < this.newest;
+    this.due ||= isLate;
+    this.pause = setTimeout(() => { this.go(); this.next(); }, isLate ? LATER : SPACING);
   }
 
   draw(plane) {

@@ -178,7 +178,7 @@ function pictureChanged(shown) {
   element("scale-light").hidden = record?.method === "map";
   showPosition();
   charts.mark(picture.held ? shown.frame : null);
-  values.frame = heldFrame();
+  [values.frame, values.shown] = [heldFrame(), shown.frame];
   values.changed();
   overlay.look(heldFrame(), newest?.frame ?? null);
 }

@@ -3,6 +3,8 @@ import { count, duration, number, percent, withUnit } from "./words.js";
 
 // Between two questions, so that a pointer on its way asks little.
 const SPACING = 50;
+// Until the next one, where the values of a later frame are on their way.
+const LATER = 1_000;
 const LIMIT = 5_000;
 const PLANE_LIMIT = 30_000;
 const DOWNLOAD_LIMIT = 600_000;
@@ -42,8 +44,11 @@ export class Values {
     this.kept = null;
     this.pixel = null;
     this.frame = null;
+    // Number of the picture that is shown.
+    this.shown = null;
     this.busy = false;
     this.due = false;
+    this.later = null;
   }
 
   receiveState({ values }) {
@@ -83,6 +88,9 @@ export class Values {
       if (answer.values) this.show(valueWords(answer.values), answer.values.no_error);
       else this.show(`No value: ${answer.problem}`);
     }
+    // A server apart from the run gets its values about once a second.
+    clearTimeout(this.later);
+    if (this.frame === null && answer.values?.frame < this.shown) this.later = setTimeout(() => this.changed(), LATER);
     setTimeout(() => { this.busy = false; if (this.pixel !== null) this.next(); }, SPACING);
   }
 }

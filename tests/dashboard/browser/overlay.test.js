@@ -150,7 +150,12 @@ test("of an earlier frame, of a method without an error and beside a run the pag
   await page.context().close();
   const other = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
   await other.keyboard.press("o");
-  await until("it is said", async () => (await text(other)) === "No overlay here: only a run with --dashboard, or publish.payload = \"exr\", has them.");
+  const frame = async () => Number(/^Stated error of the linear colours.*, frame ([\d,]+)$/.exec(await text(other))?.[1].replaceAll(",", ""));
+  const first = await until("an error", frame);
+  await until("that of a later frame", async () => (await frame()) > first);
+  await other.selectOption("#overlay-of", "trusted");
+  await until("trust", async () => /^Share of the way in which the surrogate is trusted/.test(await text(other)));
+  assert.ok(await other.isVisible("#overlay"));
   assert.deepEqual(complaints, []);
   await other.context().close();
 });

@@ -156,14 +156,18 @@ test("the field of a slide is saved, and the command for it writes it too, at th
   await page.context().close();
 });
 
-test("a dashboard beside the run says that it has no values", async () => {
+test("a dashboard beside the run gets values and layers when they are asked for, and later ones while they are", async () => {
   const page = await open(`http://127.0.0.1:${beside.port}/?token=${TOKEN}`);
-  const why = /only a run with --dashboard, or publish.payload = "exr", has them/;
-  await until("it is said", async () => why.test(await line(page)));
-  assert.ok(await fits(page));
+  assert.match(await line(page), /^Point at the picture/);
   await point(page, [5, 5]);
-  await page.click('[data-save="exr"]');
-  await until("it is said", async () => /No EXR: /.test(await page.textContent("#warnings")) && why.test(await page.textContent("#warnings")));
+  const told = async () => Number(/^frame ([\d,]+) at 5, 5: /.exec(await line(page))?.[1].replaceAll(",", ""));
+  const first = await until("a value", told);
+  assert.ok(await fits(page));
+  await until("that of a later frame", async () => (await told()) > first);
+  const exr = await saved(page, "exr");
+  assert.match(exr.name, /^run-frame-\d{6}-slide-\d{4}\.exr$/);
+  const { width, channels } = readExr(exr.bytes);
+  assert.ok(width === 96 && channels.error.some((error) => error > 0));
   assert.match((await saved(page, "json")).name, /^run-frame-\d{6}-slide-\d{4}\.json$/);
   assert.match((await saved(page, "png")).name, /^run-frame-\d{6}-slide-\d{4}\.png$/);
   assert.deepEqual(complaints, []);
