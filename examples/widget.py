@@ -70,7 +70,7 @@ class LiveFrames(anywidget.AnyWidget):
             socket.setsockopt(zmq.RCVHWM, 2)
             socket.setsockopt(zmq.LINGER, 0)
             socket.connect(self.endpoint)
-            # Not to what the run is at for long (`work`), of which no picture comes, and not to all layers of frames (`layers`), which no browser draws.
+            # Not to what the run is at for long (`work`): no picture comes of that. Nor to all layers (`layers`), which no browser draws.
             socket.subscribe(b"frame")
             socket.subscribe(b"record")
             waiting, sent, heard = None, 0.0, None
