@@ -2,12 +2,13 @@
 
 use super::error::PublishError;
 use super::exr::read_exr;
+use super::preview::png_of;
 use super::run_folder::{FRAMES, OLDER_RECORDS, RECORDS};
 use crate::run::FrameRecord;
-use image::{ImageReader, Limits};
+use image::{ImageError, ImageReader, Limits};
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Longest line of the records that is read.
@@ -24,6 +25,14 @@ pub struct PastRun {
 impl Picture {
     /// Least width of a picture with a strip below (`--annotate`), so that words have room.
     pub const LEAST_WIDTH: usize = 320;
+
+    /// Encodes it as a PNG.
+    ///
+    /// # Errors
+    /// A picture without pixels, or of another size than its pixels.
+    pub fn png(&self) -> Result<Vec<u8>, ImageError> {
+        png_of(self.pixels.as_flattened(), self.size)
+    }
 }
 
 /// A picture of 8 bits, rows from the top.
@@ -38,6 +47,70 @@ pub struct Picture {
 #[derive(Deserialize)]
 struct Numbered {
     frame: u64,
+}
+
+/// A file of records, of which single lines are read.
+struct Lines {
+    path: PathBuf,
+    reader: BufReader<std::fs::File>,
+    /// Bytes when it was opened.
+    length: u64,
+}
+
+/// A complete line: where it begins, where the next one does, and the number of its frame.
+struct Line {
+    begin: u64,
+    end: u64,
+    frame: u64,
+    text: String,
+}
+
+impl Lines {
+    /// `None` if there is no such file.
+    fn open(path: PathBuf) -> Result<Option<Self>, PublishError> {
+        let failed = |error: std::io::Error| PublishError::File { path: path.clone(), problem: format!("cannot be read: {error}") };
+        match crate::files::open(&path) {
+            Ok(file) => {
+                let length = file.metadata().map_err(failed)?.len();
+                Ok(Some(Self { path, reader: BufReader::new(file), length }))
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(failed(error)),
+        }
+    }
+
+    fn failed(&self, problem: &str) -> PublishError {
+        PublishError::File { path: self.path.clone(), problem: problem.to_owned() }
+    }
+
+    /// The first line that begins at this byte or after it and is a record. `None` at the end.
+    fn after(&mut self, from: u64) -> Result<Option<Line>, PublishError> {
+        let cannot = |lines: &Self, error: std::io::Error| lines.failed(&format!("cannot be read: {error}"));
+        // The line to which the byte before belongs is passed over.
+        let mut at = from.saturating_sub(1);
+        self.reader.seek(SeekFrom::Start(at)).map_err(|error| cannot(self, error))?;
+        let mut is_passed = from == 0;
+        let mut bytes = Vec::new();
+        loop {
+            bytes.clear();
+            let read = (&mut self.reader).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes);
+            let length = read.map_err(|error| cannot(self, error))? as u64;
+            // A last line without its end is being written.
+            if length == 0 || (at + length >= self.length && !bytes.ends_with(b"\n")) {
+                return Ok(None);
+            }
+            let begin = at;
+            at += length;
+            // A line that a full disk or a kill cut short is none.
+            let found = serde_json::from_slice::<Numbered>(&bytes).ok().filter(|_| is_passed);
+            if let Some(Numbered { frame }) = found
+                && let Ok(text) = String::from_utf8(std::mem::take(&mut bytes))
+            {
+                return Ok(Some(Line { begin, end: at, frame, text: text.trim_end().to_owned() }));
+            }
+            is_passed = true;
+        }
+    }
 }
 
 impl PastRun {
@@ -111,6 +184,56 @@ impl PastRun {
             }
         }
         Ok(None)
+    }
+
+    /// The record of a frame, found among records in the order of their frames, of which few are read. `None` if the records that are left do not have it.
+    ///
+    /// # Errors
+    /// Records that cannot be read.
+    pub fn find_record(&self, frame: u64) -> Result<Option<FrameRecord>, PublishError> {
+        for mut lines in self.lines()?.into_iter().rev() {
+            let (mut low, mut high) = (0, lines.length);
+            while low < high {
+                let middle = low + (high - low) / 2;
+                match lines.after(middle)?.filter(|line| line.begin < high) {
+                    None => high = middle,
+                    Some(line) if line.frame < frame => low = line.end,
+                    Some(line) if line.frame > frame => high = middle,
+                    Some(line) => {
+                        let failed = |error: serde_json::Error| lines.failed(&format!("the record of frame {frame} is none: {error}"));
+                        return serde_json::from_str(&line.text).map(Some).map_err(failed);
+                    }
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Records over all of the run as they are written, in order: all of them, or about `most` that are evenly chosen.
+    ///
+    /// # Errors
+    /// Records that cannot be read.
+    pub fn some_records(&self, most: u64) -> Result<Vec<String>, PublishError> {
+        let mut files = self.lines()?;
+        let all: u64 = files.iter().map(|lines| lines.length).sum();
+        let step = (all / most.max(1)).max(1);
+        let mut chosen = Vec::new();
+        for lines in &mut files {
+            let mut from = 0;
+            while let Some(line) = lines.after(from)? {
+                from = line.end.max(from + step);
+                chosen.push(line.text);
+            }
+        }
+        Ok(chosen)
+    }
+
+    /// The files of the records, the older one first.
+    fn lines(&self) -> Result<Vec<Lines>, PublishError> {
+        // The newer one first: it may become the older one meanwhile, and is there then twice rather than not at all.
+        let newer = Lines::open(self.path.join(RECORDS))?;
+        let older = Lines::open(self.path.join(OLDER_RECORDS))?;
+        Ok(older.into_iter().chain(newer).collect())
     }
 
     /// The picture of a frame. `tone_map` are `[contrast, brightness, gamma]` for a frame of which only the EXR is kept.

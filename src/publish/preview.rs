@@ -45,15 +45,24 @@ pub fn raw(film: &Film) -> Vec<u8> {
     bytes
 }
 
+/// Encodes R, G, B of 8 bits, rows from the top, as a PNG.
+pub(super) fn png_of(rgb: &[u8], size: [usize; 2]) -> Result<Vec<u8>, ImageError> {
+    let mut bytes = Vec::new();
+    encode_rgb(codecs::png::PngEncoder::new(&mut bytes), rgb, size)?;
+    Ok(bytes)
+}
+
 fn encode(encoder: impl ImageEncoder, film: &Film, tone_map: [f64; 3]) -> Result<(), ImageError> {
-    let rgb = film.tone_mapped(tone_map);
-    let edge = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
-    let (width, height) = (edge(film.width), edge(film.height));
+    encode_rgb(encoder, &film.tone_mapped(tone_map), [film.width, film.height])
+}
+
+fn encode_rgb(encoder: impl ImageEncoder, rgb: &[u8], size: [usize; 2]) -> Result<(), ImageError> {
+    let [width, height] = size.map(|pixels| u32::try_from(pixels).unwrap_or(u32::MAX));
     // The encoders panic on a buffer of another length.
     if rgb.len() as u64 != u64::from(width) * u64::from(height) * 3 || rgb.is_empty() {
         return Err(ImageError::Parameter(image::error::ParameterError::from_kind(image::error::ParameterErrorKind::DimensionMismatch)));
     }
-    encoder.write_image(&rgb, width, height, ExtendedColorType::Rgb8)
+    encoder.write_image(rgb, width, height, ExtendedColorType::Rgb8)
 }
 
 #[cfg(test)]

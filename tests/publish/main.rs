@@ -5,4 +5,5 @@ mod full_disk;
 #[path = "../kit/mod.rs"]
 mod kit;
 mod layers;
+mod past_run;
 mod socket;
