@@ -59,6 +59,9 @@ pub struct Options {
     /// Let the page steer the run whose connection file this is (`replay --steer`, `attach --steer`); by default the one of the private socket.
     #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
     steer: Option<Option<PathBuf>>,
+    /// Folder of the run (`--out`), whose kept frames and records pages look back to.
+    #[arg(long, value_name = "FOLDER")]
+    run: Option<PathBuf>,
     /// Show this chart of speed against accuracy, a chart.svg of `ridgewatch chart`.
     #[arg(long, value_name = "FILE")]
     chart: Option<PathBuf>,
@@ -68,15 +71,18 @@ pub struct Options {
 pub fn run(common: &Common, options: Options) -> Result<()> {
     if !common.overrides.is_empty() {
         bail!(Usage(
-            "--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --chart".into()
+            "--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --run, --chart".into()
         ));
     }
-    let Options { endpoint, port, reach, steer, chart } = options;
+    let Options { endpoint, port, reach, steer, run, chart } = options;
+    if let Some(run) = run.as_deref().filter(|run| !run.is_dir()) {
+        bail!(Usage(format!("--run {}: no such folder; accepted: the folder of a run (--out of replay and attach)", run.display())));
+    }
     let steer = steer.map(|file| file.map_or_else(default_connection, Ok)).transpose()?;
     let is_steered = steer.is_some();
     let read = |file: PathBuf| std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()));
     let chart = chart.map(read).transpose()?;
-    let dashboard = Dashboard::start(DashboardSettings { endpoint, steer, chart, ..reach.settings(port)? })?;
+    let dashboard = Dashboard::start(DashboardSettings { endpoint, steer, run, chart, ..reach.settings(port)? })?;
     note_if_open(&dashboard);
     messages::note(format_args!("frames from {}", dashboard.endpoint()));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;

@@ -213,7 +213,7 @@ impl Session<'_> {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
             let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());
             let (endpoint, newest) = (endpoint.to_owned(), Some(Arc::clone(&newest)));
-            dashboard::beside(common, &options.reach, DashboardSettings { endpoint, steer, newest, chart, ..page })
+            dashboard::beside(common, &options.reach, DashboardSettings { endpoint, steer, newest, run: Some(out.clone()), chart, ..page })
         });
         let newest = Some(newest).filter(|_| dashboard.is_some());
         newest.iter().for_each(|newest| output.keep_newest(Arc::clone(newest)));

@@ -1,5 +1,6 @@
 //! What all browsers share: the newest picture, the latest records, the state of the publisher.
 
+use super::history::History;
 use super::metrics::{Metrics, Server};
 use super::pixels::{Kept, Pixels};
 use super::received::{Received, decode};
@@ -64,10 +65,21 @@ pub(super) struct Hub {
     /// For commands of the browsers.
     pub wheel: Wheel,
     pub pixels: Pixels,
+    /// What the run keeps in its folder.
+    pub history: Option<History>,
     /// The run is in this process.
     is_beside_run: bool,
     /// SVG of speed against accuracy.
     pub chart: Option<Bytes>,
+}
+
+/// What pages are shown beside the published messages.
+#[derive(Debug)]
+pub(super) struct Shown {
+    pub pixels: Pixels,
+    pub history: Option<History>,
+    pub chart: Option<Bytes>,
+    pub is_beside_run: bool,
 }
 
 /// The latest records, as JSON.
@@ -167,6 +179,8 @@ struct State<'a> {
     problem: Option<String>,
     steering: Reach,
     values: Kept,
+    /// Whether the folder of the run is known.
+    has_past: bool,
     /// Whether there is a chart of speed against accuracy.
     has_chart: bool,
     /// Token that only watches, for pages that may steer.
@@ -181,14 +195,16 @@ struct Head {
     payload_bytes: usize,
     /// Rows, columns and channels.
     shape: Option<[usize; 3]>,
+    tone_map: Option<[f64; 3]>,
 }
 
 impl Hub {
-    pub fn new(endpoint: String, wheel: Wheel, pixels: Pixels, chart: Option<Bytes>, is_beside_run: bool) -> Self {
+    pub fn new(endpoint: String, wheel: Wheel, Shown { pixels, history, chart, is_beside_run }: Shown) -> Self {
         Self {
             endpoint,
             wheel,
             pixels,
+            history,
             is_beside_run,
             chart,
             server: format!("{:?}", std::time::SystemTime::now()),
@@ -300,7 +316,10 @@ impl Hub {
 
     async fn take_picture(&self, given: &Bytes, picture: &Bytes) -> Result<(), String> {
         let header = understood(given)?;
-        let (_, Head { encoding, payload_bytes, shape }) = checked(header.as_bytes())?;
+        let (_, Head { encoding, payload_bytes, shape, tone_map }) = checked(header.as_bytes())?;
+        if let Some((history, tone_map)) = self.history.as_ref().zip(tone_map) {
+            *lock(&history.tone_map) = tone_map;
+        }
         if !["jpeg", "png", "exr"].contains(&encoding.as_str()) {
             return Err(format!("the publisher sends pictures as {encoding}; shown are jpeg, png and exr (publish.payload)"));
         }
@@ -384,6 +403,7 @@ impl Hub {
             problem: health.link_problem.clone().or_else(|| health.problem.clone()),
             steering: self.wheel.reach_for(token_to_share.is_some()),
             values: self.pixels.kept(),
+            has_past: self.history.is_some(),
             has_chart: self.chart.is_some(),
             token_to_share,
         };
@@ -525,7 +545,11 @@ mod tests {
 
     #[test]
     fn those_who_watch_push_out_nobody_who_steers() {
-        let hub = Arc::new(Hub::new("private".to_owned(), Wheel::new(None).0, Pixels::new(None), None, false));
+        let hub = Arc::new(Hub::new(
+            "private".to_owned(),
+            Wheel::new(None).0,
+            Shown { pixels: Pixels::new(None), history: None, chart: None, is_beside_run: false },
+        ));
         let steering = hub.enter(true);
         let watching: Vec<_> = (0..2 * MAX_CLIENTS).map(|_| hub.enter(false)).collect();
         assert_eq!(left(&hub).len(), MAX_CLIENTS);

@@ -11,6 +11,7 @@ mod client;
 mod error;
 mod field;
 mod files;
+mod history;
 mod hub;
 mod layers;
 mod metrics;
@@ -28,7 +29,8 @@ pub use token::Token;
 use crate::publish::NewestFrame;
 use access::Access;
 use bytes::Bytes;
-use hub::Hub;
+use history::History;
+use hub::{Hub, Shown};
 use pixels::Pixels;
 use ridgewatch_zmtp::{check_endpoint, private_endpoint};
 use std::io::ErrorKind;
@@ -63,6 +65,8 @@ pub struct DashboardSettings {
     /// Frames whose pixels and files are served: those of the run in this process; `None` in a process of its own, which asks the publisher for all
     /// layers while a page needs them.
     pub newest: Option<Arc<NewestFrame>>,
+    /// Folder of the run, for those who look back; `None`: pages have the frames that they received.
+    pub run: Option<PathBuf>,
     /// Chart of speed against accuracy, as SVG.
     pub chart: Option<Vec<u8>>,
 }
@@ -70,7 +74,17 @@ pub struct DashboardSettings {
 impl DashboardSettings {
     /// Serves this machine only, with these frames, to those who watch.
     pub fn local(endpoint: String, port: Option<u16>, token: Token) -> Self {
-        Self { endpoint, address: Ipv4Addr::LOCALHOST.into(), port, hosts: Vec::new(), token, steer: None, newest: None, chart: None }
+        Self {
+            endpoint,
+            address: Ipv4Addr::LOCALHOST.into(),
+            port,
+            hosts: Vec::new(),
+            token,
+            steer: None,
+            newest: None,
+            run: None,
+            chart: None,
+        }
     }
 }
 
@@ -91,7 +105,7 @@ impl Dashboard {
     /// # Errors
     /// An endpoint or a name of a host that is not accepted, a port in use, or an error of the system.
     pub fn start(settings: DashboardSettings) -> Result<Self, DashboardError> {
-        let DashboardSettings { endpoint, address, port, hosts, token, steer, newest, chart } = settings;
+        let DashboardSettings { endpoint, address, port, hosts, token, steer, newest, run, chart } = settings;
         let endpoint = match endpoint.as_str() {
             crate::publish::DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|source| DashboardError::Private { source })?,
             _ => endpoint,
@@ -102,7 +116,8 @@ impl Dashboard {
         let access = Access::new(token.clone(), hosts, address)?;
         let (wheel, requests) = Wheel::new(steer);
         let is_beside_run = newest.is_some();
-        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, Pixels::new(newest), chart.map(Bytes::from), is_beside_run));
+        let shown = Shown { pixels: Pixels::new(newest), history: run.map(History::new), chart: chart.map(Bytes::from), is_beside_run };
+        let hub = Arc::new(Hub::new(endpoint.clone(), wheel, shown));
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(2).build()?;
         let listener = {
             let _inside = runtime.enter();

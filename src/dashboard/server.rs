@@ -173,6 +173,17 @@ async fn respond(request: Request, access: &Access, hub: Arc<Hub>) -> Result<Res
             None => (StatusCode::NOT_FOUND, "There is no chart of this scene: ridgewatch chart SCENE draws one.\n").into_response(),
         });
     }
+    if path.ends_with("/past") || path.ends_with("/past.json") {
+        access.check_origin(&parts.headers)?;
+        access.check_token(&parts.uri)?;
+        return Ok(match &hub.history {
+            Some(history) if path.ends_with("/past") => history.picture(&parts.uri).await,
+            Some(history) => history.list().await,
+            None => {
+                (StatusCode::NOT_FOUND, "The folder of the run is not known: ridgewatch dashboard --run FOLDER names it.\n").into_response()
+            }
+        });
+    }
     if let Some(wanted) = OfFrames::named(path) {
         access.check_origin(&parts.headers)?;
         let rights = access.check_token(&parts.uri)?;

@@ -5,6 +5,7 @@
 mod kit;
 mod layers;
 mod metrics;
+mod past;
 mod planes;
 mod program;
 mod steering;

@@ -16,6 +16,21 @@ export class Records {
   constructor() {
     this.rows = [];
     this.missing = 0;
+    // Rows over all of the run, of which few are told, and those that were dropped since.
+    this.past = [];
+    this.dropped = 0;
+  }
+
+  /** Takes in rows over all of the run, in order. */
+  setPast(rows) {
+    this.past = rows;
+    this.dropped = 0;
+  }
+
+  /** All rows in order: those before the first one that came, then all that came. */
+  get all() {
+    const first = this.rows[0]?.frame ?? Infinity;
+    return [...this.past.filter(({ frame }) => frame < first), ...this.rows];
   }
 
   /** Adds a row. Returns whether a new run began with it. */
@@ -26,7 +41,10 @@ export class Records {
     else if (last?.frame === row.frame) this.rows.pop();
     else if (last !== undefined) this.missing += row.frame - last.frame - 1;
     this.rows.push(row);
-    if (this.rows.length > MOST_RECORDS) this.rows.shift();
+    if (this.rows.length > MOST_RECORDS) {
+      this.rows.shift();
+      this.dropped += 1;
+    }
     return restarted;
   }
 
@@ -44,14 +62,32 @@ export class Records {
   clear() {
     this.rows = [];
     this.missing = 0;
+    this.setPast([]);
   }
 }
 
-/** Pictures in the order of their frames: `{ frame, elapsed, header, blob }`. */
+/** Pictures in the order of their frames: `{ frame, elapsed, header, blob }`. Those that came are in `list`. */
 export class Pictures {
   constructor() {
     this.list = [];
     this.bytes = 0;
+    // Those that the run keeps, which are fetched when they are looked at: `blob` is null until then.
+    this.past = [];
+  }
+
+  /** Takes in the numbers of the frames that the run keeps, in order. */
+  setPast(frames) {
+    const known = new Map(this.past.map((picture) => [picture.frame, picture]));
+    this.past = frames.map((frame) => known.get(frame) ?? { frame, elapsed: null, header: null, blob: null, asked: true });
+  }
+
+  /** A picture that the run no longer keeps. */
+  lose(picture) { this.past = this.past.filter((kept) => kept !== picture); }
+
+  /** All pictures in order: those of the run before the first one that came, then all that came. */
+  get all() {
+    const first = this.list[0]?.frame ?? Infinity;
+    return [...this.past.filter(({ frame }) => frame < first), ...this.list];
   }
 
   /** Adds a picture. Returns whether a new run began with it. */
@@ -71,11 +107,13 @@ export class Pictures {
   clear() {
     this.list = [];
     this.bytes = 0;
+    this.past = [];
   }
 
   /** Index of the picture whose frame is nearest to `frame`; -1 without pictures. */
   nearest(frame) {
-    const distance = (index) => Math.abs(this.list[index].frame - frame);
-    return this.list.reduce((best, _, index) => (best < 0 || distance(index) < distance(best) ? index : best), -1);
+    const { all } = this;
+    const distance = (index) => Math.abs(all[index].frame - frame);
+    return all.reduce((best, _, index) => (best < 0 || distance(index) < distance(best) ? index : best), -1);
   }
 }

@@ -10,13 +10,16 @@ import { Picture, pictureBox } from "./picture.js";
 import { followTheme, takeToken } from "./preferences.js";
 import { Steering, steerBy, steeringKeys } from "./steering.js";
 import { explainTerms, explained } from "./terms.js";
-import { Values, address as fileAddress, asker, download, downloadField, fieldCommand, histogramAsker, pictureAsker, pixelAt, planeAsker } from "./values.js";
+import { Values, address as fileAddress, asker, download, downloadField, fieldCommand, histogramAsker, pastAsker, pastLister, pictureAsker, pixelAt, planeAsker } from "./values.js";
 import { Warnings } from "./warnings.js";
 import { count, duration, facts, sentence } from "./words.js";
 
 const REFRESH = 250;
 // A sentence that is read aloud with every frame is of no use.
 const ANNOUNCE = 30_000;
+// What the run keeps is asked for again after so many milliseconds, when somebody looks back, or so many records that came and were dropped.
+const PAST_AGE = 10_000;
+const PAST_DROPPED = 1000;
 
 const element = (id) => document.getElementById(id);
 const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
@@ -25,8 +28,8 @@ const records = new Records();
 const warnings = new Warnings();
 const token = takeToken();
 const colourBar = new ColourBar(element("colour-bar"));
-const picture = new Picture(element("frame"), pictureChanged);
-const charts = new Charts(element("charts"), (frame) => picture.lookBack(picture.kept.nearest(frame)));
+const picture = new Picture(element("frame"), pictureChanged, { ask: pastAsker(token), lost: pictureLost });
+const charts = new Charts(element("charts"), (frame) => lookBack(picture.kept.nearest(frame)));
 
 const steering = new Steering({
   say: (message) => connection.say(message),
@@ -51,6 +54,7 @@ const histogram = new Histogram({
 });
 
 const askPicture = pictureAsker(token);
+const listPast = pastLister(token);
 
 let connection;
 let newest = null;
@@ -63,6 +67,8 @@ let logVersion = -1;
 // The items of the log, by entry; what changes is another entry.
 const logItems = new WeakMap();
 let announced = { kind: null, at: 0 };
+// When it was asked what the run keeps, and whether an answer is on its way.
+let past = { at: null, busy: false };
 
 // Messages
 
@@ -97,7 +103,30 @@ function receiveRecords(message) {
   chartsDue ||= fresh.length > 0;
 }
 
+/** Takes in what the run keeps, if that is known and not fresh. */
+async function refreshPast() {
+  if (server?.has_past !== true || past.busy || (past.at !== null && performance.now() - past.at < PAST_AGE)) return;
+  past = { at: performance.now(), busy: true };
+  try {
+    const { frames, records: list } = await listPast();
+    picture.kept.setPast(frames);
+    records.setPast(list.filter((record) => Number.isFinite(record?.frame)).map(rowOf));
+    chartsDue = true;
+    showPosition();
+  } catch {
+    // The page has what it received; it is asked again when somebody looks back.
+  }
+  past.busy = false;
+}
+
+function pictureLost(lost, problem) {
+  picture.kept.lose(lost);
+  warnings.hold("past", `The picture of frame ${count(lost.frame)} cannot be shown: ${problem}`, lost.frame);
+  showPosition();
+}
+
 function beginRun(frame, watched) {
+  past.at = null;
   warnings.forget();
   warnings.hold("new", "A new run began", frame, watched);
 }
@@ -191,7 +220,7 @@ function showFacts(values) {
 }
 
 function showPosition() {
-  const [last, index] = [picture.kept.list.length - 1, picture.position()];
+  const [last, index] = [picture.kept.all.length - 1, picture.position()];
   const scrub = element("scrub");
   scrub.max = Math.max(last, 0);
   scrub.value = Math.max(index, 0);
@@ -340,18 +369,24 @@ async function share() {
 
 function refresh() {
   if (values.kept?.ready !== undefined && connection.status === "open") picture.refine(askPicture);
+  if (newest !== null && (past.at === null || records.dropped > PAST_DROPPED)) refreshPast();
   showState();
   showSteering();
   showLog();
   if (!chartsDue || document.hidden) return;
   chartsDue = false;
   element("no-charts").hidden = true;
-  charts.update(records.rows);
+  charts.update(records.all);
 }
 
 // Controls
 
-const step = (by) => picture.lookBack(picture.position() + by);
+function lookBack(index) {
+  refreshPast();
+  picture.lookBack(index);
+}
+
+const step = (by) => lookBack(picture.position() + by);
 const toggleLive = () => (picture.held ? picture.follow() : picture.hold());
 
 function toggleFullScreen() {
@@ -365,7 +400,7 @@ const KEYS = {
   " ": toggleLive,
   ArrowLeft: () => step(-1),
   ArrowRight: () => step(1),
-  Home: () => picture.lookBack(0),
+  Home: () => lookBack(0),
   End: () => picture.follow(),
   o: () => overlay.cycle(element("overlay-of")),
   g: () => axes.toggle(),
@@ -387,7 +422,7 @@ function pressKey(event) {
 element("live").addEventListener("click", toggleLive);
 element("earlier").addEventListener("click", () => step(-1));
 element("later").addEventListener("click", () => step(1));
-element("scrub").addEventListener("input", (event) => picture.lookBack(event.target.valueAsNumber));
+element("scrub").addEventListener("input", (event) => lookBack(event.target.valueAsNumber));
 element("full-screen").addEventListener("click", toggleFullScreen);
 element("theme").addEventListener("click", switchTheme);
 element("open-help").addEventListener("click", () => element("help").showModal());

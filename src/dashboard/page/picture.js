@@ -16,14 +16,17 @@ export function pictureBox(canvas) {
 }
 
 export class Picture {
-  /** `changed(picture)` is called with the picture that is now shown; null if there is none. */
-  constructor(canvas, changed) {
-    this.canvas = canvas;
-    this.changed = changed;
+  /**
+   * `changed(picture)` is called with the picture that is now shown; null if there is none. `ask(frame)` resolves to the header and payload of a picture that
+   * the run keeps; `lost(picture, problem)` is called if it cannot.
+   */
+  constructor(canvas, changed, { ask, lost }) {
+    Object.assign(this, { canvas, changed, ask, lost });
     this.kept = new Pictures();
     this.shown = null;
     this.held = false;
     this.wanted = null;
+    this.fetching = false;
     new ResizeObserver(() => this.sharpen()).observe(canvas);
   }
 
@@ -77,10 +80,11 @@ export class Picture {
     this.canvas.classList.toggle("pixels", enlargement >= ENLARGED);
   }
 
-  /** Position of the shown picture among the kept ones. */
+  /** Position of the picture among all: of the one that is looked back at also while it is fetched. */
   position() {
-    const index = this.kept.list.indexOf(this.shown);
-    return index >= 0 || this.shown === null ? index : this.kept.nearest(this.shown.frame);
+    const picture = (this.held && this.wanted) || this.shown;
+    const index = this.kept.all.indexOf(picture);
+    return index >= 0 || picture === null ? index : this.kept.nearest(picture.frame);
   }
 
   /** Stops at the picture that is shown. */
@@ -98,18 +102,42 @@ export class Picture {
 
   /** Shows a kept picture and stays there. */
   async lookBack(index) {
-    const last = this.kept.list.length - 1;
-    if (last < 0) return;
+    const { all } = this.kept;
+    if (all.length === 0) return;
     this.held = true;
-    await this.load(this.kept.list[Math.min(Math.max(index, 0), last)]);
+    await this.load(all[Math.min(Math.max(index, 0), all.length - 1)]);
   }
 
   async load(picture) {
     if (picture === undefined) return;
     this.wanted = picture;
+    if (picture.blob === null) { await this.fetch(); return; }
     const bitmap = await createImageBitmap(picture.blob);
     // Meanwhile another one may have been asked for.
     if (this.wanted === picture) this.draw(picture, bitmap);
     bitmap.close();
+  }
+
+  /** Fetches the picture that is wanted, one at a time: of those that were wanted meanwhile the newest. */
+  async fetch() {
+    if (this.fetching) return;
+    this.fetching = true;
+    while (this.wanted?.blob === null) {
+      const picture = this.wanted;
+      try {
+        const { payload, ...header } = await this.ask(picture.frame);
+        const blob = new Blob([payload], { type: mediaType(header.encoding) });
+        const bitmap = await createImageBitmap(blob);
+        Object.assign(picture, { header, blob, elapsed: header.record.seconds?.elapsed ?? null });
+        if (this.wanted === picture) this.draw(picture, bitmap);
+        bitmap.close();
+        // Of the others the run has the pictures.
+        for (const other of this.kept.past) if (other !== this.shown && other !== picture) other.blob = null;
+      } catch (error) {
+        this.lost(picture, error.message);
+        if (this.wanted === picture) this.wanted = this.shown === picture ? null : this.shown;
+      }
+    }
+    this.fetching = false;
   }
 }

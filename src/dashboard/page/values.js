@@ -1,4 +1,5 @@
 // What the run knows of the pixel under the pointer, and its newest frame as a file.
+import { parseMessage } from "./protocol.js";
 import { count, duration, number, percent, withUnit } from "./words.js";
 
 // Between two questions, so that a pointer on its way asks little.
@@ -122,6 +123,12 @@ export const planeAsker = (token) => async (query) => (await get(address("plane"
 
 /** A function that asks for the picture of a frame without loss, which is empty if the frame has moved on. */
 export const pictureAsker = (token) => async (frame) => (await get(address("frame.png", token, { frame, if: "newest" }), PLANE_LIMIT)).blob();
+
+/** A function that asks for a picture that the run keeps: resolves to its header and `payload`. */
+export const pastAsker = (token) => async (frame) => parseMessage(await (await get(address("past", token, { frame }), PLANE_LIMIT)).arrayBuffer());
+
+/** A function that asks what the run keeps: `frames`, the numbers of its pictures, and `records` over all of it. */
+export const pastLister = (token) => async () => (await get(address("past.json", token, {}), PLANE_LIMIT)).json();
 
 /** A function that asks for the counts of the FTLE. */
 export const histogramAsker = (token) => async () => (await get(address("histogram", token, {}), LIMIT)).json();
