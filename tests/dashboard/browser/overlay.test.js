@@ -130,7 +130,7 @@ test("the key goes through the layers, each said with its frame and scale, and f
   await page.context().close();
 });
 
-test("of an earlier frame, of a method without an error and beside a run the page says why there is none", async () => {
+test("of an earlier frame and of a method without an error the page says why there is none, and a page beside the run has them", async () => {
   const page = await open(shown.url);
   await until("the controls", () => page.isVisible("#pause"));
   await page.selectOption("#overlay-of", "error");
