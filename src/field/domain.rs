@@ -24,17 +24,19 @@ pub struct Domain {
     /// Length per coordinate unit along each axis, in one unit for all axes, so that edges compare. 1 if the axes have the same unit; see
     /// `Grid::domain` for other axes.
     pub scale: [f64; 3],
+    /// True if axes 0 and 1 are longitudes and latitudes in degrees, on a sphere.
+    pub is_geographic: bool,
 }
 
 impl Domain {
     /// A two-dimensional domain with a slab from `z.0` to `z.1`.
     pub fn slab(min: [f64; 2], max: [f64; 2], z: (f64, f64)) -> Self {
-        Self { min: [min[0], min[1], z.0], max: [max[0], max[1], z.1], dimensions: 2, scale: [1.0; 3] }
+        Self { min: [min[0], min[1], z.0], max: [max[0], max[1], z.1], dimensions: 2, scale: [1.0; 3], is_geographic: false }
     }
 
     /// A three-dimensional domain.
     pub fn cuboid(min: [f64; 3], max: [f64; 3]) -> Self {
-        Self { min, max, dimensions: 3, scale: [1.0; 3] }
+        Self { min, max, dimensions: 3, scale: [1.0; 3], is_geographic: false }
     }
 
     /// Upper minus lower corner, in coordinates. Edges in different units do not compare (see [`Self::lengths`]).

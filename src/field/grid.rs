@@ -63,9 +63,10 @@ impl Grid {
             max: std::array::from_fn(|k| corner(k, self.slab.1, Axis::last)),
             dimensions: self.dimensions(),
             scale: [1.0; 3],
+            is_geographic: matches!(self.geometry, Geometry::Sphere { .. }),
         };
         if let [x, _, z] = &self.axes[..]
-            && (matches!(self.geometry, Geometry::Sphere { .. }) || units_differ(x.units(), z.units()))
+            && (domain.is_geographic || units_differ(x.units(), z.units()))
         {
             let extent = domain.extent();
             domain.scale[2] = VERTICAL_EDGE * extent[0].max(extent[1]) / extent[2];

@@ -1,10 +1,10 @@
 //! The picture of a map: pixels, lines, graticule, colour bars and words.
 
 use super::graticule::{GridLine, axis_unit, graticule};
-use super::projection::Projection;
 use super::sheet::{Bar, CENTRE, DrawError, Image, LEFT, Pen, Sheet, plot_error, sheet_png, sheet_svg};
 use super::view::View;
 use super::words::duration;
+use crate::render::Projection;
 use plotters::prelude::*;
 
 /// Panels in a row.

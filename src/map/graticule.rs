@@ -1,8 +1,8 @@
 //! Meridians and parallels, or the ticks of Cartesian axes.
 
-use super::projection::Projection;
 use super::view::View;
 use super::words::{even_step, number, ticks};
+use crate::render::Projection;
 
 /// A line of the graticule.
 #[derive(Debug, Clone, PartialEq)]

@@ -7,7 +7,6 @@ use super::draw::{MapFigure, Panel};
 use super::footprint::{MapTracer, Raster, RasterError, Sampling, in_parts};
 use super::graticule::axis_unit;
 use super::lines::{RidgeLine, RidgesAbout};
-use super::projection::ProjectionKind;
 use super::record::{MapRecord, PanelRecord, RidgeRecord};
 use super::ridges::{Field, Strength};
 use super::sheet::Bar;
@@ -18,6 +17,7 @@ use super::{MapError, Moment};
 use crate::backend::Device;
 use crate::field::EARTH_RADIUS;
 use crate::flow::{Direction, FlowMap, VelocitySource};
+use crate::render::ProjectionKind;
 use crate::run::{Plan, RunError};
 use std::path::Path;
 

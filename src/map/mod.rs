@@ -18,7 +18,6 @@ mod make;
 mod moment;
 mod page;
 mod pieces;
-mod projection;
 mod record;
 mod ridges;
 mod sheet;
@@ -42,7 +41,6 @@ pub use lines::{LinesFormat, RidgeLine, RidgesAbout, geojson, vtk, write_netcdf}
 pub use make::{MOST_NODES, MapOptions, MapResult, make};
 pub use moment::Moment;
 pub use page::FramePage;
-pub use projection::{Projection, ProjectionKind};
 pub use record::{MapRecord, PanelRecord, RidgeRecord};
 pub use ridges::{Field, RidgePoint, Strength};
 pub use sheet::DrawError;
@@ -54,6 +52,7 @@ pub use view::{LARGEST, View, is_geographic};
 pub use volume::Volume;
 pub use words::{Rate, date, duration, number};
 
+pub use crate::render::{Projection, ProjectionKind};
 use crate::run::RunError;
 use thiserror::Error;
 

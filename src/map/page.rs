@@ -162,6 +162,11 @@ fn between(colours: &[[u8; 3]], share: f64) -> [u8; 3] {
     }
 }
 
+/// The projection of a map that has one.
+pub(super) fn projection_of(record: &FrameRecord) -> Option<String> {
+    record.projection.map(|plane| format!("Projection: {}.", plane.projection.words()))
+}
+
 /// Source, extent, method and error of a frame, a paragraph each.
 fn words(record: &FrameRecord) -> Vec<String> {
     let mut words = vec![format!("Source: {}.", record.source.trim_end_matches('.'))];
@@ -173,6 +178,7 @@ fn words(record: &FrameRecord) -> Vec<String> {
         });
         words.push(format!("Extent: {}.", extents.collect::<Vec<_>>().join(", ")));
     }
+    words.extend(projection_of(record));
     let surrogate = record.surrogate.as_ref().map_or_else(String::new, |kind| format!(" with surrogate {kind}"));
     let samples = record.picture_error.map_or(record.samples_per_pixel, |error| error.samples_per_pixel);
     let what = if record.method == Method::Map.name() { "seeds" } else { "samples" };

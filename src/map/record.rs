@@ -1,8 +1,8 @@
 //! The record of a map.
 
 use super::footprint::{RasterError, Sampling};
-use super::projection::ProjectionKind;
 use crate::flow::Direction;
+use crate::render::ProjectionKind;
 use serde::Serialize;
 
 /// Record of a map, as JSON beside the picture.

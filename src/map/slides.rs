@@ -93,7 +93,7 @@ impl SlideMaps {
         let options = MapOptions {
             pixels: scene.render.width.max(scene.render.height).clamp(16, LARGEST),
             sampling: Sampling { seeds: SEEDS, seed: scene.seed },
-            projection: None,
+            projection: scene.render.projection.kind(),
             level: None,
             both: shown.both,
             range: self.range.filter(|of| (of.0, of.1) == (tau, direction)).map(|(_, _, range)| range),

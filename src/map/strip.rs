@@ -1,6 +1,6 @@
 //! A frame with a strip below that says what it shows: colour bar, time, source and stated error.
 
-use super::page::{bar_of, picture_error, when_of};
+use super::page::{bar_of, picture_error, projection_of, when_of};
 use super::sheet::{Bar, DrawError, Image, LEFT, Pen, Sheet, sheet_png, wrapped};
 use super::words::duration;
 use crate::publish::Picture;
@@ -33,11 +33,12 @@ pub fn annotated(frame: &Frame) -> Result<Vec<u8>, DrawError> {
     let unit = (width / 640.0).clamp(0.7, 4.0);
     let bar = frame.color_bar.as_ref().map(|colours| bar_of(record, colours, true));
     let tau = duration(record.tau, &record.time_unit);
-    let words = [
+    let mut words = vec![
         format!("{}, tau = {tau} {}, {}", when_of(record), record.direction, record.method),
         format!("Source: {}.", record.source.trim_end_matches('.')),
-        picture_error(record),
     ];
+    words.extend(projection_of(record));
+    words.push(picture_error(record));
     let words = wrapped(&words, 13.0 * unit, width - 16.0 * unit)?;
     let below = 8.0 + if bar.is_some() { BAR } else { 0.0 } + LINE * words.len() as f64 + 6.0;
     sheet_png(&Strip { picture, bar, words, size: [width, (film.height as f64 + below * unit).ceil()], unit })

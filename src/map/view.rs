@@ -1,8 +1,8 @@
 //! The window of a map: which place each pixel shows.
 
-use super::projection::{Projection, ProjectionKind};
 use crate::field::{Domain, DomainPoint, Geometry};
 use crate::flow::VelocitySource;
+use crate::render::{Projection, ProjectionKind, outline};
 
 /// The box of the data, seen through a projection by a raster of pixels.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,12 +49,8 @@ impl View {
             }
             Some(kind) => kind,
         };
-        let projection = Projection::new(kind, region)?;
-        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for place in outline(region) {
-            let [x, y] = projection.forward(place);
-            (low, high) = ([low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]);
-        }
+        let projection = Projection::new(kind, region).map_err(|why| why.to_string())?;
+        let [low, high] = projection.bounds(region);
         let extent = [high[0] - low[0], high[1] - low[1]];
         // Axes of different lengths, such as heights over distances, are stretched: a strip of a few pixels shows nothing.
         let longer = extent[0].max(extent[1]);
@@ -68,15 +64,7 @@ impl View {
 
     /// Coordinates of a place in pixels, from the upper left corner. `None` outside of the data.
     pub fn place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
-        let [mut u, v] = self.projection.inverse([self.corner[0] + x * self.pixel, self.corner[1] - y * self.pixel]);
-        let [west, south, east, north] = self.region;
-        if self.is_geographic {
-            u = west + (u - west).rem_euclid(360.0);
-        }
-        // Rounding of the projection at the rim.
-        let slack = 1e-9 * (east - west);
-        (u >= west - slack && u <= east + slack && v >= south - slack && v <= north + slack)
-            .then(|| [u.clamp(west, east), v.clamp(south, north)])
+        self.projection.place_in(self.region, [self.corner[0] + x * self.pixel, self.corner[1] - y * self.pixel])
     }
 
     /// Where coordinates lie, in pixels from the upper left corner.
@@ -107,15 +95,4 @@ impl View {
         }
         vec![lines(&whole)]
     }
-}
-
-/// The rim of a region, dense enough to be straight between its points.
-fn outline([west, south, east, north]: [f64; 4]) -> Vec<[f64; 2]> {
-    const PARTS: usize = 180;
-    let corners = [[west, south], [east, south], [east, north], [west, north], [west, south]];
-    let between = |pair: &[[f64; 2]]| {
-        let (from, to) = (pair[0], pair[1]);
-        (0..PARTS).map(move |k| [0, 1].map(|axis| from[axis] + (to[axis] - from[axis]) * k as f64 / PARTS as f64))
-    };
-    corners.windows(2).flat_map(between).chain([corners[0]]).collect()
 }

@@ -28,16 +28,8 @@ impl CameraSettings {
         let extent: [f64; 3] = std::array::from_fn(|k| domain.extent()[k] * scale[k]);
         let centre: [f64; 3] = std::array::from_fn(|k| 0.5 * (domain.min[k] + domain.max[k]) * scale[k]);
         if domain.dimensions == 2 {
-            // At 90 degrees the distance to the film plane is half of its width.
-            let distance = 0.5 * extent[0].max(extent[1] * aspect);
-            let top = domain.max[2] * scale[2];
-            return Self {
-                eye: [centre[0], centre[1], top + distance],
-                look_at: [centre[0], centre[1], top],
-                up: [0.0, 1.0, 0.0],
-                field_of_view: 90.0,
-                orthographic: true,
-            };
+            let [low, high] = [domain.min, domain.max].map(|end| [end[0] * scale[0], end[1] * scale[1]]);
+            return Self::above([low, high], domain.max[2] * scale[2], aspect);
         }
         // The published camera divides the angle by the aspect ratio, so that tall pictures need a small angle.
         let field_of_view = 45.0 * aspect.min(1.0);
@@ -57,6 +49,16 @@ impl CameraSettings {
         }
         let eye = std::array::from_fn(|k| centre[k] + 1.1 * distance * toward_eye[k]);
         Self { eye, look_at: centre, up: [0.0, 0.0, 1.0], field_of_view, orthographic: false }
+    }
+}
+
+impl CameraSettings {
+    /// The camera that sees a rectangle from above, `top` being the height of what it looks at: the rectangle fills a picture of aspect ratio `aspect`.
+    pub fn above([low, high]: [[f64; 2]; 2], top: f64, aspect: f64) -> Self {
+        let [x, y] = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
+        // At 90 degrees the distance to the film plane is half of its width.
+        let distance = 0.5 * (high[0] - low[0]).max((high[1] - low[1]) * aspect);
+        Self { eye: [x, y, top + distance], look_at: [x, y, top], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true }
     }
 }
 

@@ -5,7 +5,7 @@
 
 use super::renderer::{RenderStats, Renderer};
 use super::smooth::{MarchError, PictureError, TILE, TileSums, smoothed};
-use super::{CameraSettings, Film, LogStretch};
+use super::{CameraSettings, Film, LogStretch, MapPlane};
 use rayon::prelude::*;
 use ridgewatch_field::DomainPoint;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -91,8 +91,8 @@ impl Pixel {
 /// A map that accumulates seeds.
 #[derive(Debug, Default)]
 pub struct MapPicture {
-    /// The view that the sums are of: camera, scale, size and seed.
-    shows: Option<(CameraSettings, [f64; 3], [usize; 2], u64)>,
+    /// The view that the sums are of: camera, scale, plane, size and seed.
+    shows: Option<(CameraSettings, [f64; 3], Option<MapPlane>, [usize; 2], u64)>,
     pixels: Vec<Pixel>,
     /// Seeds of a half of a pixel so far.
     seeds: usize,
@@ -110,7 +110,7 @@ impl MapPicture {
     ) -> Option<(Film, RenderStats, PictureError)> {
         let scene = renderer.scene();
         let size = [scene.settings.width, scene.settings.height];
-        let shows = (scene.camera.clone(), scene.scale, size, scene.seed);
+        let shows = (scene.camera.clone(), scene.scale, scene.plane, size, scene.seed);
         if self.shows.as_ref() != Some(&shows) {
             *self = Self { shows: Some(shows), pixels: vec![Pixel::default(); size[0] * size[1]], seeds: 0 };
         }

@@ -142,13 +142,23 @@ impl Renderer {
         self.inverse_tau.into()
     }
 
-    /// Domain point in the middle of a slab that is seen through a point of the film (`x` from -1, left, to 1; `y` from -1, bottom, to 1). `None` outside
-    /// of the domain.
+    /// Domain point in the middle of a slab that is seen through a point of the film (`x` from -1, left, to 1; `y` from -1, bottom, to 1), in the plane of
+    /// the scene if there is one. `None` outside of the domain.
     pub fn map_point(&self, [x, y]: [f64; 2]) -> Option<DomainPoint> {
         let (origin, direction) = self.camera.ray(x, y);
         let along = (self.space.centre()[2] - origin[2]) / direction[2];
-        let point = std::array::from_fn(|k| origin[k] + along * direction[k]);
-        (along >= 0.0 && along.is_finite()).then(|| self.space.point_within(point))?
+        let point: [f64; 3] = std::array::from_fn(|k| origin[k] + along * direction[k]);
+        if !(along >= 0.0 && along.is_finite()) {
+            return None;
+        }
+        match &self.scene.plane {
+            Some(plane) => {
+                let [longitude, latitude] = plane.place_in(&self.domain, [point[0], point[1]])?;
+                let middle = 0.5 * (self.domain.min[2] + self.domain.max[2]);
+                Some(self.space.inward([longitude, latitude, middle]))
+            }
+            None => self.space.point_within(point),
+        }
     }
 
     /// Optical ramp of a log-stretch under the current transfer function: 0 where nothing is shown.

@@ -1,7 +1,7 @@
 //! A scene: camera, light, transfer function and picture settings.
 
 use super::error::{RenderError, require};
-use super::{CameraSettings, LightSettings, RenderSettings, TransferSettings, overview_scale};
+use super::{CameraSettings, LightSettings, MapPlane, Method, RenderSettings, TransferSettings, overview_scale};
 use ridgewatch_field::Domain;
 
 /// A scene to render. Camera, light and extinction are in scene units: domain coordinates times `scale`.
@@ -19,6 +19,8 @@ pub struct Scene {
     pub seed: u64,
     /// Scene units per domain unit, along each axis.
     pub scale: [f64; 3],
+    /// The plane of maps of longitudes and latitudes, which they show instead of the box. `None`: plain coordinates.
+    pub plane: Option<MapPlane>,
 }
 
 impl Scene {
@@ -35,16 +37,23 @@ impl Scene {
         let transfer = transfer.unwrap_or_default();
         let exact = camera.is_some() || transfer.extinction.is_some() || light.as_ref().is_some_and(|l| l.position.is_some());
         let scale = if exact { [1.0; 3] } else { overview_scale(domain) };
+        // One that is refused is told by `check`.
+        let plane = MapPlane::new(domain, &settings, camera.as_ref(), scale).unwrap_or(None);
         let aspect = settings.width.max(1) as f64 / settings.height.max(1) as f64;
         // The light shines from above and behind the camera. Maps are seen with north up, boxes with z up from the corner of low x and y.
         let direction = if domain.dimensions == 2 { [-1.0, -1.0, -1.0] } else { [0.7, 0.5, -1.0] };
+        let overview = || match plane.filter(|_| settings.method == Method::Map) {
+            Some(plane) => CameraSettings::above(plane.bounds(domain), domain.max[2] * scale[2], aspect),
+            None => CameraSettings::overview(domain, scale, aspect),
+        };
         Self {
-            camera: camera.unwrap_or_else(|| CameraSettings::overview(domain, scale, aspect)),
+            camera: camera.unwrap_or_else(overview),
             light: light.unwrap_or_else(|| LightSettings::directional(direction, 12.0)),
             transfer,
             settings,
             seed,
             scale,
+            plane,
         }
     }
 
@@ -57,6 +66,9 @@ impl Scene {
     /// Checks everything that camera, light and transfer function do not check themselves.
     pub(super) fn check(&self, domain: &Domain) -> Result<(), RenderError> {
         self.settings.check()?;
+        if self.plane.is_none() {
+            MapPlane::new(domain, &self.settings, None, self.scale)?;
+        }
         let finite = domain.min.iter().chain(&domain.max).all(|v| v.is_finite());
         require(finite && domain.extent().iter().all(|e| *e > 0.0), "domain", (domain.min, domain.max), "finite corners, max above min")?;
         require(self.scale.iter().all(|s| s.is_finite() && *s > 0.0), "scene scale", self.scale, "three finite numbers above 0")

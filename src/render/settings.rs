@@ -3,6 +3,7 @@
 use super::albedo::{albedo_preset, published_albedo};
 use super::error::{RenderError, require};
 use super::map_picture::MAP_TONE;
+use super::projection::ProjectionKind;
 use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -80,6 +81,38 @@ impl Method {
             Self::Default if is_map => Self::Map,
             Self::Default => Self::TwoLevel,
             other => other,
+        }
+    }
+}
+
+/// Projection of a map of longitudes and latitudes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ProjectionChoice {
+    /// The one that fits the region ([`ProjectionKind::fitting`]); plain if the scene sets a camera, whose lengths are degrees.
+    Auto,
+    /// [`ProjectionKind::PlateCarree`].
+    PlateCarree,
+    /// [`ProjectionKind::Mercator`].
+    Mercator,
+    /// [`ProjectionKind::Lambert`].
+    Lambert,
+    /// [`ProjectionKind::Polar`].
+    Polar,
+    /// [`ProjectionKind::Plain`].
+    Plain,
+}
+
+impl ProjectionChoice {
+    /// The kind that is named; `None` for `auto`.
+    pub fn kind(self) -> Option<ProjectionKind> {
+        match self {
+            Self::Auto => None,
+            Self::PlateCarree => Some(ProjectionKind::PlateCarree),
+            Self::Mercator => Some(ProjectionKind::Mercator),
+            Self::Lambert => Some(ProjectionKind::Lambert),
+            Self::Polar => Some(ProjectionKind::Polar),
+            Self::Plain => Some(ProjectionKind::Plain),
         }
     }
 }
@@ -241,6 +274,8 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
+    /// `map`: projection of longitudes and latitudes.
+    pub projection: ProjectionChoice,
     /// Samples per pixel and frame. Smooth methods accept fractions; `marched` takes twice [`super::smooth::AUDIT_PAIRS`] instead, and `map` the next even
     /// number.
     pub samples: f64,
@@ -267,6 +302,7 @@ impl Default for RenderSettings {
             method: Method::Default,
             width: 320,
             height: 160,
+            projection: ProjectionChoice::Auto,
             samples: 8.0,
             combine: Combine::Shrink,
             until: None,

@@ -127,11 +127,13 @@ impl SceneBox {
     pub fn point_within(&self, point: [f64; 3]) -> Option<DomainPoint> {
         let inside = (0..3).all(|k| (self.min[k]..=self.max[k]).contains(&point[k]));
         inside.then(|| {
-            DomainPoint(std::array::from_fn(|k| {
-                let domain = self.domain_min[k] + (point[k] - self.min[k]) / self.cell_edge[k] * self.cell_extent[k];
-                (domain as f32).clamp(self.inward_min[k], self.inward_max[k])
-            }))
+            self.inward(std::array::from_fn(|k| self.domain_min[k] + (point[k] - self.min[k]) / self.cell_edge[k] * self.cell_extent[k]))
         })
+    }
+
+    /// Domain coordinates in single precision, clamped to the box.
+    pub fn inward(&self, domain: [f64; 3]) -> DomainPoint {
+        DomainPoint(std::array::from_fn(|k| (domain[k] as f32).clamp(self.inward_min[k], self.inward_max[k])))
     }
 
     /// Grid coordinates of a domain point, clamped to the grid.

@@ -4,7 +4,7 @@ use super::Settings;
 use super::record::{DomainRecord, FrameRecord};
 use super::setup::assemble;
 use crate::field::Domain;
-use crate::render::{Film, Method, Renderer, Scene, TransferSettings, map_radiance};
+use crate::render::{Film, Method, ProjectionChoice, Renderer, Scene, TransferSettings, map_radiance};
 use serde::{Deserialize, Serialize};
 
 /// Colours of a bar.
@@ -52,6 +52,8 @@ impl ColorBar {
         let domain = Domain { dimensions: axes.len(), ..Domain::cuboid(*min, *max) };
         let mut scene = Scene { camera: camera.clone(), scale: record.scale, ..assemble(settings, &domain) };
         [scene.settings.width, scene.settings.height] = record.size;
+        // Colours have none, and a record does not say whether its axes are those of a globe.
+        scene.settings.projection = ProjectionChoice::Auto;
         let (low, high, extinction) = (Some(transfer.low), Some(transfer.high), Some(transfer.extinction));
         let albedo = record.albedo.clone().unwrap_or(scene.transfer.albedo);
         scene.transfer = TransferSettings { low, high, extinction, albedo };

@@ -426,6 +426,7 @@ impl Run<'_> {
             tolerance: self.learning.trust.tolerance(),
             camera: Some(self.renderer.scene().camera.clone()),
             scale: self.renderer.scene().scale,
+            projection: self.renderer.scene().plane.filter(|_| self.render.method == Method::Map),
             domain: Some(domain_record(self.plan, slide)),
             commands: std::mem::take(&mut self.progress.commands),
             traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,

@@ -1,8 +1,8 @@
 //! Record of a frame: a line of `records.jsonl`, and part of the header of a published frame.
 
 use super::steering::Command;
-use crate::render::CameraSettings;
 use crate::render::smooth::PictureError;
+use crate::render::{CameraSettings, MapPlane};
 use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
 
@@ -40,6 +40,9 @@ pub struct FrameRecord {
     /// Scene units of `camera` per unit of the domain's coordinates, along each axis.
     #[serde(default)]
     pub scale: [f64; 3],
+    /// The plane that a map is drawn in. `None` for plain coordinates, as of volumes.
+    #[serde(default)]
+    pub projection: Option<MapPlane>,
     /// Box of the seeds, which the picture shows. `None` in records of earlier versions.
     #[serde(default)]
     pub domain: Option<DomainRecord>,

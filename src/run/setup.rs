@@ -8,7 +8,7 @@ use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, op
 use super::{MapSettings, RunError, Settings, TimeSettings, TimeSpan, TrainingSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
-use crate::render::{Combine, Method, RenderSettings, Renderer, Scene, TransferSettings};
+use crate::render::{Combine, Method, ProjectionChoice, ProjectionKind, RenderSettings, Renderer, Scene, TransferSettings};
 use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
 use crate::source::{
@@ -202,6 +202,7 @@ impl Setup {
             Some(source) => refused.over(&source.name()),
             None => refused,
         })?;
+        decisions.extend(chosen_projection(&scene, &domain));
         scene.surrogate.check_nodes(domain.dimensions)?;
         let followed = scene.source.kind == SourceKind::Archive && scene.archive.follow.is_some();
         // After the checks that read nothing.
@@ -309,10 +310,26 @@ fn unused_by_maps(scene: &Settings) -> Option<String> {
     (!keys.is_empty()).then(|| format!("without effect on a map: {}", keys.join(", ")))
 }
 
-/// What is said of maps of the slides that a flow in three dimensions has not.
-fn unused_by_volumes(scene: &Settings, domain: &Domain) -> Option<String> {
+/// What is said of keys of maps that a flow in three dimensions, or a picture of a volume, has not.
+fn unused_by_volumes(scene: &Settings, domain: &Domain) -> Vec<String> {
     let is_idle = domain.dimensions == 3 && scene.maps != MapSettings::default();
-    is_idle.then(|| "without effect on a flow of three dimensions: maps".to_owned())
+    let maps = is_idle.then(|| "without effect on a flow of three dimensions: maps".to_owned());
+    let is_volume = scene.render.method != Method::Map && scene.render.projection != ProjectionChoice::Auto;
+    let projection =
+        is_volume.then(|| format!("without effect with render.method = \"{}\": render.projection", scene.render.method.name()));
+    maps.into_iter().chain(projection).collect()
+}
+
+/// The projection of a map, if the scene leaves it open and the data have longitudes and latitudes.
+fn chosen_projection(scene: &Settings, domain: &Domain) -> Option<Decision> {
+    if scene.render.method != Method::Map || scene.render.projection != ProjectionChoice::Auto || !domain.is_geographic {
+        return None;
+    }
+    let (chosen, why) = match assemble(scene, domain).plane {
+        Some(plane) => (plane.projection.kind(), "fits the region of the longitudes and latitudes"),
+        None => (ProjectionKind::Plain, "the scene sets a camera, which is in degrees"),
+    };
+    Some(Decision::new("render.projection", word(chosen), why))
 }
 
 /// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.

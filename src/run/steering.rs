@@ -114,8 +114,8 @@ pub struct SteeringState {
 /// The commands to a run. Its memory does not grow with them: a later value replaces an earlier one that has not taken effect.
 #[derive(Debug)]
 pub struct Steering {
-    /// The view at the start.
-    home: CameraSettings,
+    /// The view at the start, of the box and of the plane of a map.
+    homes: [CameraSettings; 2],
     aspect: f64,
     /// Edges of the box, in scene units.
     edges: [f64; 3],
@@ -160,10 +160,14 @@ impl Steering {
     pub fn new(plan: &Plan) -> Self {
         let scene = &plan.scene;
         let Domain { dimensions, .. } = plan.domain;
-        let assembled = assemble(scene, &plan.domain);
+        let assembled = |method: Method| {
+            let mut scene = scene.clone();
+            scene.render.method = method;
+            assemble(&scene, &plan.domain)
+        };
         Self {
-            edges: assembled.edges(&plan.domain),
-            home: assembled.camera,
+            edges: assembled(scene.render.method).edges(&plan.domain),
+            homes: [Method::Reference, Method::Map].map(|method| assembled(method).camera),
             aspect: scene.render.aspect(),
             trust: scene.trust.clone(),
             transfer: scene.transfer.clone().unwrap_or_default(),
@@ -214,7 +218,8 @@ impl Steering {
         let mut change = Change::default();
         for (key, value) in set {
             match key.as_str() {
-                "camera" if value.is_null() => change.camera = Some(self.home.clone()),
+                // Below, since it is that of the method.
+                "camera" if value.is_null() => {}
                 "camera" => {
                     let camera: CameraSettings = read(key, value, "eye, look_at, up, field_of_view and orthographic, as in a scene file")?;
                     Camera::new(&camera, self.aspect).map_err(Refused::from)?;
@@ -261,6 +266,11 @@ impl Steering {
                     return Err(Refused::new(other, "cannot change during a run", accepted));
                 }
             }
+        }
+        let [before, after] = [method, change.method.unwrap_or(method)].map(|method| &self.homes[usize::from(method == Method::Map)]);
+        // A map in a projection and the box are different places of the scene.
+        if set.get("camera").is_some_and(Value::is_null) || (before != after && change.camera.is_none()) {
+            change.camera = Some(after.clone());
         }
         if let Some(budget) = change.budget {
             // Of the method that comes with it, if one does.
@@ -396,9 +406,13 @@ mod tests {
         steering_of(&RenderSettings { method: Method::TwoLevel, ..RenderSettings::default() })
     }
 
+    fn home(z: f64) -> CameraSettings {
+        CameraSettings { eye: [0.0, 0.0, z], look_at: [0.0; 3], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true }
+    }
+
     fn steering_of(render: &RenderSettings) -> Steering {
         Steering {
-            home: CameraSettings { eye: [0.0, 0.0, 2.0], look_at: [0.0; 3], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true },
+            homes: [home(2.0), home(2.0)],
             aspect: 2.0,
             edges: [2.0, 1.0, 0.2],
             trust: TrustSettings::default(),
@@ -532,6 +546,24 @@ mod tests {
     }
 
     #[test]
+    fn a_method_in_another_plane_begins_with_its_own_view() {
+        let mut steering = steering_of(&RenderSettings { method: Method::TwoLevel, ..RenderSettings::default() });
+        let camera = |steering: &Steering, set| {
+            command(steering, set).unwrap();
+            steering.take().pop().and_then(|command| command.set.camera)
+        };
+        assert_eq!(camera(&steering, json!({"render.method": "map"})), None, "the same plane");
+        steering.homes[1] = home(3.0);
+        assert_eq!(camera(&steering, json!({"render.method": "two_level"})), Some(home(2.0)));
+        assert_eq!(camera(&steering, json!({"render.method": "gated", "paused": false})), None);
+        assert_eq!(camera(&steering, json!({"render.method": "map", "camera": home(5.0)})), Some(home(5.0)));
+        assert_eq!(camera(&steering, json!({"camera": null})), Some(home(3.0)), "of the method in effect");
+        assert_eq!(camera(&steering, json!({"camera": null, "render.method": "gated"})), Some(home(2.0)));
+        assert_eq!(camera(&steering, json!({"render.method": "map"})), Some(home(3.0)));
+        assert_eq!(camera(&steering, json!({"trust.tolerance": 0.1})), None);
+    }
+
+    #[test]
     fn a_later_value_replaces_one_that_has_not_taken_effect() {
         let steering = steering();
         for n in 1..=1000 {
@@ -542,10 +574,7 @@ mod tests {
         assert!(steering.is_pending_within(Duration::ZERO) && !steering.is_paused());
         let taken = steering.take();
         assert_eq!(serde_json::to_value(&taken[0]).unwrap(), json!({"number": 1000, "set": {"trust.tolerance": 1000.0}}));
-        assert_eq!(
-            (taken.len(), taken[1].number, &taken[1].set.camera, taken[1].set.paused),
-            (2, 1001, &Some(steering.home.clone()), Some(false))
-        );
+        assert_eq!((taken.len(), taken[1].number, &taken[1].set.camera, taken[1].set.paused), (2, 1001, &Some(home(2.0)), Some(false)));
         assert!(!steering.is_pending_within(Duration::from_millis(1)));
         command(&steering, json!({"paused": true})).unwrap();
         assert_eq!(steering.end().len(), 1, "no frame has shown it");

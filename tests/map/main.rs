@@ -4,6 +4,7 @@
 mod annotate;
 mod command;
 mod figure;
+mod frames;
 mod geometry;
 #[path = "../kit/mod.rs"]
 mod kit;

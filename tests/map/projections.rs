@@ -1,6 +1,10 @@
 //! Projections: there and back, equal scales, and the choice by region.
 
+use crate::kit::program::{json, project};
+use ridgewatch::field::Domain;
 use ridgewatch::map::{Projection, ProjectionKind};
+use ridgewatch::render::{MapPlane, ProjectionChoice, RenderSettings};
+use serde_json::{Value, json};
 
 /// Regions (west, south, east, north) that each kind can show.
 const SHOWN: [(ProjectionKind, [f64; 4]); 8] = [
@@ -73,7 +77,52 @@ fn the_region_chooses() {
         assert_eq!(ProjectionKind::fitting(region), kind, "{region:?}");
         Projection::new(kind, region).unwrap();
     }
-    assert!(Projection::new(ProjectionKind::Lambert, [0.0, -10.0, 20.0, 10.0]).unwrap_err().contains("plate_carree"));
-    assert!(Projection::new(ProjectionKind::Mercator, [0.0, -10.0, 20.0, 89.0]).unwrap_err().contains("polar"));
-    assert!(Projection::new(ProjectionKind::Polar, [0.0, -10.0, 20.0, 89.0]).unwrap_err().contains("one side of the equator"));
+    assert!(Projection::new(ProjectionKind::Lambert, [0.0, -10.0, 20.0, 10.0]).unwrap_err().to_string().contains("plate_carree"));
+    assert!(Projection::new(ProjectionKind::Mercator, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("polar"));
+    assert!(Projection::new(ProjectionKind::Polar, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("one side of the equator"));
+}
+
+/// The page of the dashboard has these projections too. Its tests read the same numbers: planes as records tell them, and places of the scene.
+#[test]
+fn the_page_is_tested_with_these_numbers() {
+    let kinds = [
+        (ProjectionChoice::PlateCarree, [14.875, -40.125, 34.875, -30.125]),
+        (ProjectionChoice::Mercator, [-60.0, -40.0, 40.0, 60.0]),
+        (ProjectionChoice::Lambert, [-20.0, 30.0, 50.0, 72.0]),
+        (ProjectionChoice::Lambert, [100.0, -60.0, 180.0, -20.0]),
+        (ProjectionChoice::Polar, [0.0, 60.0, 360.0, 90.0]),
+        (ProjectionChoice::Polar, [-180.0, -90.0, 180.0, -50.0]),
+    ];
+    let cases = kinds.map(|(projection, region)| {
+        let [west, south, east, north] = region;
+        let domain = Domain { is_geographic: true, ..Domain::slab([west, south], [east, north], (0.0, 1.0)) };
+        let settings = RenderSettings { projection, ..RenderSettings::default() };
+        let plane = MapPlane::new(&domain, &settings, None, [0.02, 0.02, 0.25]).unwrap().unwrap();
+        let places: Vec<[f64; 2]> = places(region).step_by(53).collect();
+        let scene: Vec<[f64; 2]> = places
+            .iter()
+            .map(|place| {
+                let at = plane.projection.forward(*place);
+                [0, 1].map(|k| plane.origin[k] + plane.unit * at[k])
+            })
+            .collect();
+        json!({"projection": plane, "places": places, "scene": scene})
+    });
+    let file = json(&project("tests/dashboard/browser/projections.json"));
+    assert!(alike(&json!(cases), &file), "tests/dashboard/browser/projections.json is to hold {}", json!(cases));
+}
+
+/// Whether two values are the same but for the rounding of their numbers.
+fn alike(one: &Value, other: &Value) -> bool {
+    match (one, other) {
+        (Value::Array(a), Value::Array(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| alike(a, b)),
+        (Value::Object(a), Value::Object(b)) => {
+            a.len() == b.len() && a.iter().all(|(key, value)| b.get(key).is_some_and(|other| alike(value, other)))
+        }
+        (Value::Number(a), Value::Number(b)) => match (a.as_f64(), b.as_f64()) {
+            (Some(a), Some(b)) => (a - b).abs() <= 1e-11 * (1.0 + a.abs()),
+            _ => false,
+        },
+        _ => one == other,
+    }
 }

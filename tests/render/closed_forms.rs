@@ -45,6 +45,7 @@ fn scene(width: usize, light: LightSettings) -> Scene {
         },
         seed: 11,
         scale: [1.0; 3],
+        plane: None,
     }
 }
 

@@ -42,6 +42,7 @@ fn scene(width: usize, extinction: f64, majorant_cells: Option<[usize; 3]>, seed
         settings: RenderSettings { width, height: width, background: [0.0; 3], majorant_cells, ..RenderSettings::default() },
         seed,
         scale: [1.0; 3],
+        plane: None,
     }
 }
 

@@ -54,6 +54,7 @@ fn scene(width: usize, seed: u64) -> Scene {
         settings: RenderSettings { width, height: width, background: [0.0; 3], ..RenderSettings::default() },
         seed,
         scale: [1.0; 3],
+        plane: None,
     }
 }
 

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_4;
+use thiserror::Error;
 
 /// Kind of a projection, as it is named on the command line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -19,8 +20,19 @@ pub enum ProjectionKind {
     Plain,
 }
 
+/// A kind of projection cannot show a region.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("{why}; accepted: {accepted}")]
+pub struct Unprojectable {
+    /// What the kind cannot show.
+    pub why: String,
+    /// Kinds that are accepted.
+    pub accepted: &'static str,
+}
+
 /// A projection. Planes have the unit of the sphere's radius, or of the coordinates for [`Self::Plain`].
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Projection {
     /// [`ProjectionKind::PlateCarree`]: the factor of x.
     PlateCarree {
@@ -33,6 +45,8 @@ pub enum Projection {
     Lambert {
         /// Longitude that points up, degrees.
         middle: f64,
+        /// Latitudes at which lengths are those on the sphere, degrees; `n` and `factor` follow from them.
+        parallels: [f64; 2],
         /// Sine of the cone.
         n: f64,
         /// Factor of the distance from the cone's top.
@@ -89,28 +103,31 @@ impl Projection {
     /// The projection of a kind for a region, in degrees.
     ///
     /// # Errors
-    /// The kind cannot show the region; the text says why and what is accepted.
-    pub fn new(kind: ProjectionKind, [west, south, east, north]: [f64; 4]) -> Result<Self, String> {
+    /// The kind cannot show the region.
+    pub fn new(kind: ProjectionKind, [west, south, east, north]: [f64; 4]) -> Result<Self, Unprojectable> {
         let (middle, latitude) = ((west + east) / 2.0, (south + north) / 2.0);
+        let refused = |why: String, accepted| Err(Unprojectable { why, accepted });
         match kind {
             ProjectionKind::Plain => Ok(Self::Plain),
             ProjectionKind::PlateCarree if east - west > 180.0 => Ok(Self::PlateCarree { cosine: 1.0 }),
             ProjectionKind::PlateCarree => Ok(Self::PlateCarree { cosine: latitude.to_radians().cos() }),
-            ProjectionKind::Mercator if south < -MERCATOR_END || north > MERCATOR_END => Err(format!(
-                "mercator ends at {MERCATOR_END} degrees, and the data reach from {south:.2} to {north:.2}; accepted: plate_carree, polar"
-            )),
+            ProjectionKind::Mercator if south < -MERCATOR_END || north > MERCATOR_END => refused(
+                format!("mercator ends at {MERCATOR_END} degrees, and the data reach from {south:.2} to {north:.2}"),
+                "plate_carree, polar",
+            ),
             ProjectionKind::Mercator => Ok(Self::Mercator),
             ProjectionKind::Lambert if south * north <= 0.0 || east - west > 180.0 => {
-                Err("lambert shows one side of the equator and at most 180 degrees of longitude; accepted: plate_carree, mercator".into())
+                refused("lambert shows one side of the equator and at most 180 degrees of longitude".into(), "plate_carree, mercator")
             }
             ProjectionKind::Lambert => {
                 // Standard parallels a sixth of the height inside, as in common use (Snyder, page 105).
                 let [first, second] = [south + (north - south) / 6.0, north - (north - south) / 6.0];
                 let n = (first.to_radians().cos() / second.to_radians().cos()).ln() / (isometric(second) - isometric(first));
-                Ok(Self::Lambert { middle, n, factor: first.to_radians().cos() * (n * isometric(first)).exp() / n })
+                let factor = first.to_radians().cos() * (n * isometric(first)).exp() / n;
+                Ok(Self::Lambert { middle, parallels: [first, second], n, factor })
             }
             ProjectionKind::Polar if south * north <= 0.0 => {
-                Err("polar shows one side of the equator; accepted: plate_carree, mercator".into())
+                refused("polar shows one side of the equator".into(), "plate_carree, mercator")
             }
             ProjectionKind::Polar => Ok(Self::Polar { middle, pole: latitude.signum() }),
         }
@@ -145,7 +162,7 @@ impl Projection {
             Self::Plain => [x, y],
             Self::PlateCarree { cosine } => [x.to_radians() * cosine, y.to_radians()],
             Self::Mercator => [x.to_radians(), isometric(y)],
-            Self::Lambert { middle, n, factor } => {
+            Self::Lambert { middle, n, factor, .. } => {
                 let (rho, theta) = (factor * (-n * isometric(y)).exp(), n * (x - middle).to_radians());
                 [rho * theta.sin(), -rho * theta.cos()]
             }
@@ -162,7 +179,7 @@ impl Projection {
             Self::Plain => [x, y],
             Self::PlateCarree { cosine } => [(x / cosine).to_degrees(), y.to_degrees()],
             Self::Mercator => [x.to_degrees(), latitude_of(y)],
-            Self::Lambert { middle, n, factor } => {
+            Self::Lambert { middle, n, factor, .. } => {
                 let rho = n.signum() * x.hypot(y);
                 let theta = (n.signum() * x).atan2(-n.signum() * y);
                 [middle + (theta / n).to_degrees(), latitude_of((factor / rho).ln() / n)]
@@ -173,4 +190,33 @@ impl Projection {
             }
         }
     }
+
+    /// Coordinates of a place in the plane that lies in a region, on whose rim rounding is forgiven; `None` outside.
+    pub fn place_in(&self, [west, south, east, north]: [f64; 4], plane: [f64; 2]) -> Option<[f64; 2]> {
+        let [u, v] = self.inverse(plane);
+        let slack = 1e-9 * (east - west);
+        (u >= west - slack && u <= east + slack && v >= south - slack && v <= north + slack)
+            .then(|| [u.clamp(west, east), v.clamp(south, north)])
+    }
+
+    /// Lower and upper ends of a region in the plane.
+    pub fn bounds(&self, region: [f64; 4]) -> [[f64; 2]; 2] {
+        let mut ends = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+        for place in outline(region) {
+            let [x, y] = self.forward(place);
+            ends = [[ends[0][0].min(x), ends[0][1].min(y)], [ends[1][0].max(x), ends[1][1].max(y)]];
+        }
+        ends
+    }
+}
+
+/// The rim of a region, dense enough to be straight between its points.
+pub fn outline([west, south, east, north]: [f64; 4]) -> Vec<[f64; 2]> {
+    const PARTS: usize = 180;
+    let corners = [[west, south], [east, south], [east, north], [west, north], [west, south]];
+    let between = |pair: &[[f64; 2]]| {
+        let (from, to) = (pair[0], pair[1]);
+        (0..PARTS).map(move |k| [0, 1].map(|axis| from[axis] + (to[axis] - from[axis]) * k as f64 / PARTS as f64))
+    };
+    corners.windows(2).flat_map(between).chain([corners[0]]).collect()
 }
