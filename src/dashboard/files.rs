@@ -34,6 +34,7 @@ const FILES: &[File] = &[
     file!("picture.js", SCRIPT),
     file!("plane.js", SCRIPT),
     file!("preferences.js", SCRIPT),
+    file!("projection.js", SCRIPT),
     file!("protocol.js", SCRIPT),
     file!("steering.js", SCRIPT),
     file!("terms.js", SCRIPT),

@@ -40,7 +40,7 @@ export class Axes {
 
   /** Shows the axes of this record's picture. */
   show(record) {
-    const drawn = JSON.stringify([record?.camera, record?.scale, record?.domain, record?.size]);
+    const drawn = JSON.stringify([record?.camera, record?.scale, record?.projection, record?.domain, record?.size]);
     if (drawn === this.drawn) return;
     this.drawn = drawn;
     this.record = record ?? null;
@@ -59,7 +59,8 @@ export class Axes {
       made.textContent = text;
       return made;
     };
-    this.root.replaceChildren(...lines.flatMap(({ ends, hidden }) => ["halo", "line"].map((kind) => {
+    this.root.replaceChildren(...lines.flatMap(({ ends, points, hidden }) => ["halo", "line"].map((kind) => {
+      if (points) return node("polyline", { points: points.map((place) => at(place).map((value) => value.toFixed(1)).join()).join(" "), class: kind });
       const [x1, y1, x2, y2] = ends.flatMap(at).map((value) => value.toFixed(1));
       return node("line", { x1, y1, x2, y2, class: hidden ? `${kind} hidden-edge` : kind });
     })));

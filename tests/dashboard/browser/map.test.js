@@ -1,6 +1,6 @@
 // A map in Chromium: its axes, values, file and picture without loss; and the box of a volume.
 import assert from "node:assert/strict";
-import { mkdirSync, readFileSync } from "node:fs";
+import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
 import path from "node:path";
 import { after, before, test } from "node:test";
 import { valueWords } from "../../../src/dashboard/page/values.js";
@@ -9,10 +9,34 @@ import { launch, readExr, startShown, stop, temporary, until } from "./kit.js";
 const SCREENSHOTS = process.env.SCREENSHOTS ?? path.join(import.meta.dirname, "screenshots");
 const folder = temporary();
 const other = temporary();
+const third = temporary();
 let browser;
 let map;
 let volume;
+let cap;
 let complaints;
+
+/** Winds of the northern cap as a store of Zarr 2, at three times. Returns its folder. */
+function writeCap(folder) {
+  const store = path.join(folder, "cap.zarr");
+  const write = (name, dimensions, values, attributes) => {
+    const shape = dimensions.map((dimension) => axes[dimension].length);
+    mkdirSync(path.join(store, name), { recursive: true });
+    const file = (ending, content) => writeFileSync(path.join(store, name, ending), content);
+    file(".zarray", JSON.stringify({ zarr_format: 2, shape, chunks: shape, dtype: "<f4", compressor: null, fill_value: null, order: "C", filters: null }));
+    file(".zattrs", JSON.stringify({ _ARRAY_DIMENSIONS: dimensions, ...attributes }));
+    file(shape.map(() => 0).join("."), new Uint8Array(Float32Array.from(values).buffer));
+  };
+  const axes = { time: [0, 12, 24], lat: Array.from({ length: 31 }, (_, j) => 60 + j), lon: Array.from({ length: 180 }, (_, i) => 2 * i) };
+  write("time", ["time"], axes.time, { units: "hours since 2002-01-01" });
+  write("lat", ["lat"], axes.lat, { units: "degrees_north" });
+  write("lon", ["lon"], axes.lon, { units: "degrees_east" });
+  writeFileSync(path.join(store, ".zgroup"), JSON.stringify({ zarr_format: 2 }));
+  const wind = (of) => axes.time.flatMap(() => axes.lat.flatMap((lat) => axes.lon.map((lon) => of((lat * Math.PI) / 180, (lon * Math.PI) / 180))));
+  write("u", ["time", "lat", "lon"], wind((lat, lon) => (40 * Math.sin(6 * lat) + 15 * Math.sin(3 * lon)) * Math.cos(lat)), { units: "m s-1" });
+  write("v", ["time", "lat", "lon"], wind((lat, lon) => 15 * Math.cos(3 * lon) * Math.sin(4 * lat)), { units: "m s-1" });
+  return store;
+}
 
 before(async () => {
   mkdirSync(SCREENSHOTS, { recursive: true });
@@ -20,11 +44,13 @@ before(async () => {
   const changes = { "render.method": '"map"', "render.budget": null, "render.width": 320, "render.height": 160, "camera.orthographic": true };
   map = await startShown(folder, { changes, more: [`--steer=ipc://${folder}/commands`] });
   volume = await startShown(other, { scene: "configs/abc.toml", changes: { "time.frames_per_slide": 1000, "time.slides": 1 } });
+  const still = { "render.budget": null, "render.width": 320, "render.height": 240, "time.tau": 86_400, "time.frames_per_slide": 100_000, "time.slides": 1, "flow.steps": 10 };
+  cap = await startShown(third, { scene: writeCap(third), changes: still, more: [`--steer=ipc://${third}/commands`] });
 });
 
 after(async () => {
   await browser?.close();
-  for (const child of [map?.child, volume?.child]) if (child) await stop(child);
+  for (const child of [map?.child, volume?.child, cap?.child]) if (child) await stop(child);
 });
 
 async function open(address, options = {}) {
@@ -113,6 +139,38 @@ test("a map says its values, seeds and error, and is saved as a field", async ()
   assert.match(file.suggestedFilename(), /^run-frame-\d{6}-slide-\d{4}\.nc$/);
   assert.equal(readFileSync(await file.path()).subarray(0, 3).toString(), "CDF");
   await until("the method", async () => (await page.inputValue("#method")) === "map");
+  assert.deepEqual(complaints, []);
+  await page.context().close();
+});
+
+test("a map in a projection has meridians and parallels, moves in its plane, and is saved with it", async () => {
+  const page = await open(cap.url);
+  const named = async (words) => (await labels(page)).find(({ text }) => text === words);
+  await until("the controls", () => page.isVisible("#pause"));
+  await until("a meridian", () => named("180°"));
+  // Down from the pole, which is the middle of the picture.
+  assert.ok(Math.abs((await named("180°")).x - 0.5) < 0.05 && (await named("180°")).y > 0.9, JSON.stringify(await labels(page)));
+  await assertLegible(page);
+  assert.ok(await page.locator("#axes polyline.line").count() > 6);
+  await page.screenshot({ path: path.join(SCREENSHOTS, "cap.png") });
+  // Beside the disc there are no data.
+  const box = await page.locator("#frame").boundingBox();
+  await page.mouse.move(box.x + 4, box.y + 4);
+  await until("no value in a corner", async () => /: no value$/.test(await page.textContent("#values")));
+  await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+  await until("a value at the pole", async () => /: FTLE \S+ ± /.test(await page.textContent("#values")));
+  await page.mouse.down();
+  await page.mouse.move(box.x + box.width * 0.75, box.y + box.height / 2, { steps: 4 });
+  await page.mouse.up();
+  await until("a pole under the pointer", async () => Math.abs(((await named("180°"))?.x ?? 0) - 0.75) < 0.05);
+  await page.mouse.wheel(0, -1500);
+  await until("finer lines", async () => (await labels(page)).some(({ text }) => /^8[6-9](\.\d)?°N$/.test(text)));
+  await page.screenshot({ path: path.join(SCREENSHOTS, "cap-near.png") });
+  await page.keyboard.press("0");
+  await until("the first view", async () => Math.abs(((await named("180°"))?.x ?? 0) - 0.5) < 0.05);
+  const [file] = await Promise.all([page.waitForEvent("download"), page.click("#field")]);
+  const bytes = readFileSync(await file.path());
+  assert.ok(bytes.subarray(0, 3).toString() === "CDF" && bytes.includes("polar_stereographic"));
   assert.deepEqual(complaints, []);
   await page.context().close();
 });
