@@ -210,6 +210,11 @@ impl GridMapping {
 }
 
 impl Positions {
+    /// Longitudes and latitudes at nodes over ascending x and y, x fastest; NaN where they are unknown.
+    pub fn new(names: [&str; 2], x: Vec<f64>, y: Vec<f64>, degrees: Vec<[f64; 2]>) -> Self {
+        Self { names: names.map(str::to_owned), x, y, degrees }
+    }
+
     /// Longitude and latitude at a place between the nodes, bilinear; `None` beyond them, or where they are unknown. Longitudes may jump by 360
     /// degrees between nodes.
     pub fn at(&self, x: f64, y: f64) -> Option<[f64; 2]> {
@@ -272,6 +277,28 @@ fn between(nodes: &[f64], value: f64) -> Option<(usize, f64)> {
 }
 
 impl Georeference {
+    /// Of a plane in metres, by the CF name of its projection and the numbers of it, on a sphere. Times are those of `self`.
+    pub fn in_plane(&self, mapping: &str, numbers: &[(&str, &[f64])], positions: Positions) -> Self {
+        let axis = |k: usize| Coordinate {
+            name: ["x", "y"][k].into(),
+            units: "m".into(),
+            standard_name: Some(["projection_x_coordinate", "projection_y_coordinate"][k].into()),
+            long_name: None,
+            positive: None,
+            conversion: Conversion::Linear(1.0),
+        };
+        let radius = [("earth_radius", &[EARTH_RADIUS][..])];
+        let numbers = numbers.iter().chain(&radius);
+        let attributes = std::iter::once(("grid_mapping_name".to_owned(), MappingValue::Text(mapping.into())))
+            .chain(numbers.map(|(name, values)| ((*name).to_owned(), MappingValue::Numbers(values.to_vec()))));
+        Self {
+            axes: vec![axis(0), axis(1)],
+            mapping: Some(GridMapping { name: "crs".into(), attributes: attributes.collect() }),
+            positions: Some(positions),
+            calendar: self.calendar,
+        }
+    }
+
     /// A time, in seconds, as a date (`2002-01-01T00:00:00Z`), whether or not a snapshot has it; `None` if times are no dates.
     pub fn date(&self, time: f64) -> Option<String> {
         Calendar::parse(self.calendar?)?.iso(time)

@@ -5,10 +5,11 @@ use crate::kit::publishing;
 use crate::kit::scene::{self, double_gyre};
 use crate::visitor::{Visitor, ask, get};
 use crate::{LIMIT, Stage, raw_publisher};
+use ridgewatch::field::{Domain, EARTH_RADIUS};
 use ridgewatch::publish::{
     FrameHeader, MapAbout, NewestFrame, NewestSlide, NoField, Payload, channels_at, decode_exr, encode_exr, jpeg, png, read_exr,
 };
-use ridgewatch::render::{CameraSettings, Film};
+use ridgewatch::render::{CameraSettings, Film, MapPlane, Method, ProjectionChoice, RenderSettings, Scene};
 use ridgewatch::run::{ColorBar, DomainRecord, Frame, FrameRecord, ShownSlide};
 use ridgewatch_zmtp::Keep;
 use serde_json::{Value, json};
@@ -213,6 +214,71 @@ fn a_map_is_a_field_on_axes() {
     newest.put(frame(6, film));
     let (status, answer) = get(address, &format!("/frame.nc?token={token}"), &[]);
     assert!(status == 404 && answer.contains("a picture of a volume"), "{answer}");
+}
+
+/// A map of longitudes and latitudes in the projection of a name, which fills its picture.
+fn projected_frame(projection: ProjectionChoice, [west, south, east, north]: [f64; 4], size: [usize; 2]) -> (Frame, MapPlane) {
+    let domain = Domain { is_geographic: true, ..Domain::slab([west, south], [east, north], (0.0, 1.0)) };
+    let [width, height] = size;
+    let settings = RenderSettings { method: Method::Map, width, height, projection, ..RenderSettings::default() };
+    let scene = Scene::assemble(&domain, None, None, None, settings, 0);
+    let axes = [["lon", "degrees_east"], ["lat", "degrees_north"]].map(|axis| axis.map(str::to_owned)).to_vec();
+    let found = map_frame(3, size, scene.camera);
+    let record = FrameRecord {
+        scale: scene.scale,
+        projection: scene.plane,
+        domain: Some(DomainRecord { min: domain.min, max: domain.max, axes }),
+        ..(*found.record).clone()
+    };
+    (Frame { record: Arc::new(record), ..found }, scene.plane.unwrap())
+}
+
+#[test]
+fn a_map_in_a_projection_is_a_field_in_its_plane() {
+    let cap = [0.0, 60.0, 360.0, 90.0];
+    let (frame, plane) = projected_frame(ProjectionChoice::Polar, cap, [8, 8]);
+    let (stage, newest) = stage(Some(frame));
+    let (address, token) = (stage.address(), stage.token.clone());
+    let read = || {
+        let (head, found) = bytes(address, &format!("/frame.nc?token={token}"));
+        assert!(head.starts_with("HTTP/1.1 200"), "{head}: {}", String::from_utf8_lossy(&found));
+        let file = tempfile::Builder::new().suffix(".nc").tempfile().unwrap();
+        std::fs::write(file.path(), found).unwrap();
+        netcdf::open(file.path()).unwrap()
+    };
+    let values = |file: &netcdf::File, name: &str| file.variable(name).unwrap().get_values::<f64, _>(..).unwrap();
+    let words = |file: &netcdf::File, name: &str, attribute: &str| {
+        file.variable(name).unwrap().attribute_value(attribute).unwrap().unwrap().try_into().unwrap_or_else(|_| String::new())
+    };
+    let file = read();
+    let [x, y, lon, lat, ftle] = ["x", "y", "lon", "lat", "ftle"].map(|name| values(&file, name));
+    // The parallel of 60 degrees is the rim of the picture: 2 R tan 15 degrees from the pole.
+    let rim = 2.0 * 15_f64.to_radians().tan() * EARTH_RADIUS;
+    for (k, found) in x.iter().enumerate() {
+        let wanted = rim * ((k as f64 + 0.5) / 4.0 - 1.0);
+        assert!((found - wanted).abs() < 1e-3 * rim && (y[k] - wanted).abs() < 1e-3 * rim, "{x:?} {y:?}");
+    }
+    assert_eq!((lon.len(), lat.len(), ftle.len()), (64, 64, 64));
+    for (i, (lon, lat)) in lon.iter().zip(&lat).enumerate() {
+        let [u, v] = plane.projection.inverse([x[i % 8] / EARTH_RADIUS, y[i / 8] / EARTH_RADIUS]);
+        assert!((lon - u).abs() < 1e-6 && (lat - v).abs() < 1e-6, "pixel {i}: {lon} {lat}, not {u} {v}");
+    }
+    assert_eq!((words(&file, "ftle", "coordinates"), words(&file, "ftle", "grid_mapping")), ("lon lat".to_owned(), "crs".to_owned()));
+    assert_eq!(words(&file, "crs", "grid_mapping_name"), "polar_stereographic");
+    assert_eq!(words(&file, "x", "standard_name"), "projection_x_coordinate");
+    // Upwards, as the axis; the film is from the top.
+    let film = film([8, 8], true);
+    assert_eq!(ftle[0], f64::from(film.ftle_mean[7 * 8]));
+    // Beside the cone of a region there is no place.
+    newest.put(projected_frame(ProjectionChoice::Lambert, [-20.0, 30.0, 50.0, 72.0], [8, 8]).0);
+    let file = read();
+    assert_eq!(words(&file, "crs", "grid_mapping_name"), "lambert_conformal_conic");
+    // In plate carree, longitudes and latitudes are axes.
+    newest.put(projected_frame(ProjectionChoice::PlateCarree, [-170.0, -80.0, 170.0, 80.0], [17, 8]).0);
+    let file = read();
+    let (x, y) = (values(&file, "x"), values(&file, "y"));
+    assert!(file.variable("lon").is_none() && (x.len(), y.len()) == (17, 8));
+    assert!((x[0] + 160.0).abs() < 1e-9 && (y[0] + 70.0).abs() < 1e-9, "{x:?} {y:?}");
 }
 
 /// A dashboard that is a process of its own has what the run publishes.

@@ -2,11 +2,11 @@
 
 use super::cf::{CfError, CfFile};
 use super::{FieldFrame, Of};
-use crate::field::{Domain, Geometry};
+use crate::field::{Domain, EARTH_RADIUS, Geometry};
 use crate::flow::Direction;
-use crate::render::{Camera, Method};
-use crate::run::{Frame, FrameRecord, Plan};
-use crate::source::{Georeference, utc};
+use crate::render::{Camera, MapPlane, Method, Projection};
+use crate::run::{DomainRecord, Frame, FrameRecord, Plan};
+use crate::source::{Georeference, Positions, utc};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -41,9 +41,14 @@ impl MapAbout {
     }
 }
 
-/// Pixels of a picture whose centres lie in the domain.
+/// The plane of a projection in which parallels and meridians are no axes of even steps. Pixels then lie along its own, in metres.
+fn curved(record: &FrameRecord) -> Option<MapPlane> {
+    record.projection.filter(|plane| !matches!(plane.projection, Projection::PlateCarree { .. }))
+}
+
+/// Pixels of a picture whose centres lie in the domain; all of them in the plane of a projection.
 struct Centres {
-    /// Domain coordinates of the first and the last centre along x and y, ascending.
+    /// Coordinates of the first and the last centre along x and y, ascending: of the domain, or metres in the plane of a projection.
     first: [f64; 2],
     last: [f64; 2],
     /// First column and number of columns; the same of rows, from the top.
@@ -63,8 +68,14 @@ impl Centres {
         let at = |column: f64, row: f64| {
             let (origin, direction) = camera.ray(2.0 * (column + 0.5) / width as f64 - 1.0, 1.0 - 2.0 * (row + 0.5) / height as f64);
             let along = (middle - origin[2]) / direction[2];
-            [0, 1].map(|k| (origin[k] + along * direction[k]) / record.scale[k])
+            let scene = [0, 1].map(|k| origin[k] + along * direction[k]);
+            match record.projection {
+                None => [0, 1].map(|k| scene[k] / record.scale[k]),
+                Some(plane) if curved(record).is_some() => plane.plane(scene).map(|x| EARTH_RADIUS * x),
+                Some(plane) => plane.projection.inverse(plane.plane(scene)),
+            }
         };
+        let ends = |k: usize| if curved(record).is_some() { f64::NEG_INFINITY..=f64::INFINITY } else { domain.min[k]..=domain.max[k] };
         let (corner, right, down) = (at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0));
         let step = [right[0] - corner[0], corner[1] - down[1]];
         // A millionth of a pixel, more than rounding in a near view.
@@ -78,7 +89,7 @@ impl Centres {
             return Err("its view is turned or tilted, so that pixels do not lie along x and y".into());
         }
         let inside = |k: usize, count: usize, place: &dyn Fn(usize) -> f64| {
-            let within = |i: &usize| (domain.min[k]..=domain.max[k]).contains(&place(*i));
+            let within = |i: &usize| ends(k).contains(&place(*i));
             let first = (0..count).find(within)?;
             Some([first, (first..count).take_while(within).count()])
         };
@@ -97,6 +108,47 @@ impl Centres {
         let rows = (self.rows[0]..self.rows[0] + self.rows[1]).rev();
         rows.flat_map(|row| layer[row * width + first..][..count].iter().map(|value| f64::from(*value))).collect()
     }
+}
+
+/// Longitudes and latitudes of pixels that lie along the axes of a plane, by the CF conventions for grid mappings. `None` if none lies in the domain.
+fn on_sphere(plane: &MapPlane, domain: &DomainRecord, head: &FieldFrame) -> Option<Georeference> {
+    let [x, y] = [0, 1].map(|k| head.coordinates(k));
+    let DomainRecord { min, max, .. } = domain;
+    let places = y.iter().flat_map(|&y| x.iter().map(move |&x| [x / EARTH_RADIUS, y / EARTH_RADIUS]));
+    let is_seen = |place| plane.projection.place_in([min[0], min[1], max[0], max[1]], place).is_some();
+    places.clone().any(is_seen).then_some(())?;
+    // Beside a cone there is no place.
+    let middle = match plane.projection {
+        Projection::Lambert { middle, .. } | Projection::Polar { middle, .. } => Some(middle),
+        _ => None,
+    };
+    let is_place = |degrees: &[f64; 2]| degrees[1].is_finite() && middle.is_none_or(|middle| (degrees[0] - middle).abs() <= 180.0);
+    let known = |degrees: [f64; 2]| if is_place(&degrees) { degrees } else { [f64::NAN; 2] };
+    let degrees = places.map(|place| known(plane.projection.inverse(place))).collect();
+    let positions = Positions::new(["lon", "lat"], x, y, degrees);
+    Some(match plane.projection {
+        Projection::Lambert { middle, parallels, n, .. } => {
+            let numbers: [(_, &[f64]); 3] = [
+                ("standard_parallel", &parallels),
+                ("longitude_of_central_meridian", &[middle]),
+                // The top of the cone.
+                ("latitude_of_projection_origin", &[90.0 * n.signum()]),
+            ];
+            head.georeference.in_plane("lambert_conformal_conic", &numbers, positions)
+        }
+        Projection::Polar { middle, pole } => {
+            let numbers: [(_, &[f64]); 3] = [
+                ("straight_vertical_longitude_from_pole", &[middle]),
+                ("latitude_of_projection_origin", &[90.0 * pole]),
+                ("scale_factor_at_projection_origin", &[1.0]),
+            ];
+            head.georeference.in_plane("polar_stereographic", &numbers, positions)
+        }
+        _ => {
+            let numbers: [(_, &[f64]); 2] = [("standard_parallel", &[0.0]), ("longitude_of_projection_origin", &[0.0])];
+            head.georeference.in_plane("mercator", &numbers, positions)
+        }
+    })
 }
 
 /// A frame of the method `map` as NetCDF by the CF conventions: the FTLE of its pixels, the error of each, and the share without a velocity.
@@ -118,7 +170,7 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
     let ([min_x, min_y], [max_x, max_y]) = (centres.first, centres.last);
     let domain = Domain { dimensions: 2, ..Domain::cuboid([min_x, min_y, 0.0], [max_x, max_y, 1.0]) };
     let steps = record.integration_steps.map_or_else(|| "adaptive steps".to_owned(), |steps| format!("{steps} steps"));
-    let head = FieldFrame {
+    let mut head = FieldFrame {
         grid: [centres.columns[1], centres.rows[1], 1],
         domain,
         geometry: Geometry::Cartesian,
@@ -133,6 +185,10 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
         pointwise: None,
         of: Of::Pixels,
     };
+    if let (Some(plane), Some(domain)) = (curved(record), &record.domain) {
+        let outside = || NoField::Missing("the frame is no field on axes: no pixel lies in the domain".into());
+        head.georeference = on_sphere(&plane, domain, &head).ok_or_else(outside)?;
+    }
     let refused = |error: &dyn std::fmt::Display| NoField::System(error.to_string());
     let folder = tempfile::tempdir().map_err(|error| refused(&error))?;
     let path = folder.path().join("map.nc");
