@@ -1,6 +1,6 @@
 //! The picture of a map: pixels, lines, graticule, colour bars and words.
 
-use super::graticule::{GridLine, axis_unit, graticule};
+use super::graticule::{GridLine, axis_unit, degrees_over, graticule};
 use super::sheet::{Bar, CENTRE, DrawError, Image, LEFT, Pen, Sheet, plot_error, sheet_png, sheet_svg};
 use super::view::View;
 use super::words::duration;
@@ -21,6 +21,8 @@ pub struct MapFigure {
     pub footer: Vec<String>,
     /// Names and units of Cartesian axes; `None` for degrees.
     pub axes: Option<[(String, String); 2]>,
+    /// Longitudes and latitudes at nodes over a panel ([`super::graticule::nodes_over`]), if its axes are neither.
+    pub degrees: Option<Vec<[f64; 2]>>,
     /// What all panels show.
     pub view: View,
     /// Panels, one for each tau.
@@ -173,6 +175,13 @@ impl<B: DrawingBackend> Pen<'_, B> {
                 self.label(line, axis, corner, view, u, &mut taken)?;
             }
         }
+        if let Some(degrees) = &figure.degrees {
+            let mut taken: Vec<[f64; 2]> = Vec::new();
+            for line in degrees_over(view, degrees, u) {
+                self.line(&line.points, corner, BLACK.mix(0.28), 0.7 * u)?;
+                self.label_inside(&line, corner, view, u, &mut taken)?;
+            }
+        }
         for line in &panel.contours {
             self.line(line, corner, WHITE.mix(0.9), 1.2 * u)?;
         }
@@ -203,6 +212,21 @@ impl<B: DrawingBackend> Pen<'_, B> {
             self.text(&words(1), [corner[0] - 32.0 * u - widest, corner[1] + h / 2.0], 14.0 * u, CENTRE, FontTransform::Rotate270)?;
         }
         Ok(())
+    }
+
+    /// Label on a light ground at the first point of a line, inside of the panel: beside it stand the labels of its own axes.
+    fn label_inside(&self, line: &GridLine, corner: [f64; 2], view: &View, u: f64, taken: &mut Vec<[f64; 2]>) -> Result<(), DrawError> {
+        let size = 13.0 * u;
+        let half = [self.width(&line.label, size)? / 2.0 + 2.0 * u, size / 2.0];
+        let place = [0, 1].map(|k| line.points[0][k].min(view.size[k] as f64 - half[k] - 2.0 * u).max(half[k] + 2.0 * u));
+        if taken.iter().any(|other| (0..2).all(|k| (other[k] - place[k]).abs() < 2.0 * half[k] + 2.0 * u)) {
+            return Ok(());
+        }
+        taken.push(place);
+        let middle = [place[0] + corner[0], place[1] + corner[1]];
+        let ends = [self.at([middle[0] - half[0], middle[1] - half[1]]), self.at([middle[0] + half[0], middle[1] + half[1]])];
+        self.area.draw(&Rectangle::new(ends, WHITE.mix(0.75).filled())).map_err(plot_error)?;
+        self.text(&line.label, [middle[0], middle[1] - size / 2.0], size, CENTRE, FontTransform::None)
     }
 
     /// Tick and label at the first point of a line, outward along it. `taken`: places of labels that this one must not touch.

@@ -5,7 +5,7 @@ use super::colour::{LAND, OUTSIDE, Ramp, overprinted, range};
 use super::contour::contours;
 use super::draw::{MapFigure, Panel};
 use super::footprint::{MapTracer, Raster, RasterError, Sampling, in_parts};
-use super::graticule::axis_unit;
+use super::graticule::{axis_unit, nodes_over};
 use super::lines::{RidgeLine, RidgesAbout};
 use super::record::{MapRecord, PanelRecord, RidgeRecord};
 use super::ridges::{Field, Strength};
@@ -372,7 +372,10 @@ fn figure(
     let missing = traced.iter().any(|t| t.raster.missing.iter().any(|m| *m >= 0.5)).then(|| "Grey: land or missing.".to_owned());
     let projection = Some(format!("Projection: {}.", view.projection.words()));
     footer.push([projection, missing, ridges, contours, speed].into_iter().flatten().collect::<Vec<_>>().join(" "));
+    // Axes that are no degrees may be those of a known projection.
+    let degrees = if view.is_geographic { None } else { plan.georeference.degrees(&nodes_over(view)) };
     MapFigure {
+        degrees,
         title: format!("{what}: {}", name(plan)).trim_end_matches([':', ' ']).to_owned(),
         subtitle: format!("{}{tau}{level}", when(moment)),
         footer,

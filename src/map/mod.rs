@@ -36,7 +36,7 @@ pub use contour::contours;
 pub use draw::{MapFigure, write_png, write_svg};
 pub use find::{FoundRidges, RidgesOfMoment, RidgesRecord, find};
 pub use footprint::{MapTracer, Raster, RasterError, Sampling};
-pub use graticule::{GridLine, graticule, latitude, longitude};
+pub use graticule::{GridLine, degrees_over, graticule, latitude, longitude, nodes_over};
 pub use lines::{LinesFormat, RidgeLine, RidgesAbout, geojson, vtk, write_netcdf};
 pub use make::{MOST_NODES, MapOptions, MapResult, make};
 pub use moment::Moment;

@@ -6,6 +6,7 @@ use crate::cf::coordinate::{Kind, classify};
 use crate::cf::units::Unit;
 use crate::formats::{Attribute, DataFile, Variable};
 use crate::grids::{AxisPlan, Layout, Quantity, REFERENCE_PRESSURE, Resampling, SCALE_HEIGHT};
+use crate::projection::Projection;
 use ridgewatch_field::EARTH_RADIUS;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -297,6 +298,18 @@ impl Georeference {
             positions: Some(positions),
             calendar: self.calendar,
         }
+    }
+
+    /// Longitudes and latitudes at places (x, y) of axes that are neither, in degrees: by those of the file, else by its grid mapping; NaN where they are
+    /// unknown. `None` if neither tells.
+    pub fn degrees(&self, places: &[[f64; 2]]) -> Option<Vec<[f64; 2]>> {
+        const UNKNOWN: [f64; 2] = [f64::NAN; 2];
+        if let Some(positions) = &self.positions {
+            return Some(places.iter().map(|&[x, y]| positions.at(x, y).unwrap_or(UNKNOWN)).collect());
+        }
+        let mapping = self.mapping.as_ref()?;
+        let projection = Projection::of(mapping.kind(), |name| mapping.numbers(name), 1.0)?;
+        Some(places.iter().map(|place| projection.position(*place).unwrap_or(UNKNOWN)).collect())
     }
 
     /// A time, in seconds, as a date (`2002-01-01T00:00:00Z`), whether or not a snapshot has it; `None` if times are no dates.

@@ -1,8 +1,9 @@
 //! Projections: there and back, equal scales, and the choice by region.
 
-use crate::kit::program::{json, project};
-use ridgewatch::field::Domain;
-use ridgewatch::map::{Projection, ProjectionKind};
+use crate::kit::netcdf::{Data, Fixture, NETCDF4, f32s, fill};
+use crate::kit::program::{json, project, ridgewatch, run, text};
+use ridgewatch::field::{Domain, EARTH_RADIUS};
+use ridgewatch::map::{Projection, ProjectionKind, View, degrees_over, nodes_over};
 use ridgewatch::render::{MapPlane, ProjectionChoice, RenderSettings};
 use serde_json::{Value, json};
 
@@ -80,6 +81,105 @@ fn the_region_chooses() {
     assert!(Projection::new(ProjectionKind::Lambert, [0.0, -10.0, 20.0, 10.0]).unwrap_err().to_string().contains("plate_carree"));
     assert!(Projection::new(ProjectionKind::Mercator, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("polar"));
     assert!(Projection::new(ProjectionKind::Polar, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("one side of the equator"));
+}
+
+/// Longitude and latitude in a polar stereographic plane in metres, whose meridian of 0 degrees runs down from the pole.
+fn on_cap([x, y]: [f64; 2]) -> [f64; 2] {
+    [x.atan2(-y).to_degrees(), 90.0 - 2.0 * (x.hypot(y) / (2.0 * EARTH_RADIUS)).atan().to_degrees()]
+}
+
+/// Over data in metres of a plane, lines of degrees lie where these have round values, also around a pole.
+#[test]
+fn degrees_lie_over_a_plane_of_metres() {
+    for (low, high) in [([-1.0e6, -3.0e6], [1.0e6, -1.5e6]), ([-2.0e6, -2.0e6], [2.0e6, 2.0e6])] {
+        let domain = Domain::slab(low, high, (0.0, 1.0));
+        let view = View::new(&domain, false, None, 0.5, 600).unwrap();
+        let degrees: Vec<[f64; 2]> = nodes_over(&view).into_iter().map(on_cap).collect();
+        let lines = degrees_over(&view, &degrees, 1.0);
+        let (meridians, parallels): (Vec<_>, Vec<_>) = lines.iter().partition(|line| !line.label.ends_with('N'));
+        assert!(meridians.len() >= 3 && parallels.len() >= 3, "{} {}", meridians.len(), parallels.len());
+        for line in &lines {
+            let name = line.label.trim_end_matches(['°', 'E', 'W', 'N']).trim_end_matches('°').parse::<f64>().unwrap();
+            for at in &line.points {
+                let [longitude, latitude] = on_cap(view.place(at[0], at[1]).unwrap());
+                // In the cells around the pole a longitude has no one value to go through.
+                if latitude > 89.5 {
+                    continue;
+                }
+                // Of arc; lines are straight between nodes, which a circle is not.
+                let shrink = latitude.to_radians().cos();
+                let off = if line.label.ends_with('N') { (latitude - name).abs() } else { (longitude.abs() - name).abs() * shrink };
+                assert!(off < 0.02, "{}: {longitude} {latitude}", line.label);
+            }
+            let (first, last) = (line.points[0], line.points[line.points.len() - 1]);
+            let inside = |at: [f64; 2]| (0..2).all(|k| at[k] > 2.0 && at[k] < view.size[k] as f64 - 2.0);
+            if inside(first) != inside(last) {
+                assert!(!inside(first), "{}: its label is at the pole", line.label);
+                continue;
+            }
+            let is_named_well = if line.label.ends_with('N') { first[0] >= last[0] } else { first[1] <= last[1] };
+            assert!(is_named_well, "{}: {first:?} {last:?}", line.label);
+        }
+    }
+}
+
+#[test]
+fn a_map_of_a_plane_in_metres_has_degrees_over_kilometres() {
+    let folder = tempfile::tempdir().unwrap();
+    let x: Vec<f64> = (0..21).map(|i| -1e6 + 1e5 * f64::from(i)).collect();
+    let y: Vec<f64> = (0..15).map(|i| -3e6 + 1e5 * f64::from(i)).collect();
+    let write = |mapping: bool, name: &str| {
+        let shear = |j: usize| 1e-5 * (y[j] + 2e6);
+        let axes: [(&str, &str, &[f64]); 3] = [("time", "hours since 2002-01-01", &[0.0, 12.0, 24.0]), ("y", "m", &y), ("x", "m", &x)];
+        let mut fixture = Fixture::on(NETCDF4, &axes)
+            .variable("x_wind", &["time", "y", "x"], f32s(fill(3, 15, 21, |_, j, _| shear(j))))
+            .with("units", "m s-1")
+            .with("standard_name", "x_wind")
+            .with("grid_mapping", "crs")
+            .variable("y_wind", &["time", "y", "x"], f32s(fill(3, 15, 21, |_, _, _| 0.0)))
+            .with("units", "m s-1")
+            .with("standard_name", "y_wind")
+            .with("grid_mapping", "crs");
+        if mapping {
+            fixture = fixture.variable("crs", &[], Data::F64(vec![0.0])).with("grid_mapping_name", "polar_stereographic");
+            for (key, value) in [
+                ("latitude_of_projection_origin", 90.0),
+                ("straight_vertical_longitude_from_pole", 0.0),
+                ("scale_factor_at_projection_origin", 1.0),
+                ("earth_radius", EARTH_RADIUS),
+            ] {
+                fixture = fixture.with(key, value);
+            }
+        }
+        let axis = fixture.variables.iter_mut().find(|v| v.name == "x").unwrap();
+        axis.attributes.push(("standard_name".into(), "projection_x_coordinate".into()));
+        let axis = fixture.variables.iter_mut().find(|v| v.name == "y").unwrap();
+        axis.attributes.push(("standard_name".into(), "projection_y_coordinate".into()));
+        let out = folder.path().join(format!("{name}.svg"));
+        let data = fixture.write(&folder.path().join(format!("{name}.nc")));
+        run(&mut ridgewatch([
+            "map",
+            text(&data),
+            "--device",
+            "cpu",
+            "--width",
+            "300",
+            "--seeds",
+            "2",
+            "--tau",
+            "1 day",
+            "--out",
+            text(&out),
+        ]))
+        .success();
+        std::fs::read_to_string(out).unwrap()
+    };
+    let picture = write(true, "mapped");
+    for words in ["x, km", "70°N", "0°"] {
+        assert!(picture.contains(words), "{words} is not in {picture}");
+    }
+    let picture = write(false, "unknown");
+    assert!(picture.contains("x, km") && !picture.contains('°'), "{picture}");
 }
 
 /// The page of the dashboard has these projections too. Its tests read the same numbers: planes as records tell them, and places of the scene.
