@@ -23,6 +23,7 @@ mod ridges;
 mod sheet;
 mod slides;
 mod smoothing;
+mod spline;
 mod strip;
 mod surface_files;
 mod surfaces;

@@ -4,10 +4,12 @@
 //! With g the gradient, H the Hessian and e its unit eigenvector of the smaller eigenvalue: g . e = 0, and that eigenvalue is negative and the larger
 //! one by magnitude (Lindeberg, Edge detection and ridge detection with automatic scale selection, 1998). Cells are cut into triangles whose corners agree on the
 //! sign of the direction across (Furst and Pizer, Marching ridges, 2001): e, but on the flanks of a ridge, where H has no such eigenvalue, that of H squared
-//! with a share of the neighbours'. The eigenvalues are tested at the crossing.
+//! with a share of the neighbours'. The crossing is that of the spline through the nodes, whose eigenvalues are tested there, and those of second differences
+//! too: beside ridges as narrow as a node the spline swings, and would have ridges that the nodes have not.
 
 use super::contour::{Edge, Segments};
 use super::smoothing::{is_resolved, smoothed};
+use super::spline::{Spline, zero};
 use rayon::prelude::*;
 
 /// A field on a regular grid, x fastest. Values that are not finite are missing.
@@ -92,10 +94,11 @@ struct Shape {
     slope: f64,
 }
 
-/// The smoothed field, its largest magnitude, and its shape at each node. `None` at edges, beside missing nodes, and where the field is flat within
-/// rounding.
+/// The smoothed field, the spline through it, its largest magnitude, and its shape at each node. `None` at edges, beside missing nodes, and where the
+/// field is flat within rounding.
 struct Shapes {
     smooth: Vec<f64>,
+    spline: Spline<2>,
     largest: f64,
     at: Vec<Option<Shape>>,
 }
@@ -114,8 +117,9 @@ impl Field {
         known.par_sort_unstable_by(f64::total_cmp);
         let largest = known[known.len() - 1].abs().max(known[0].abs());
         let [least, faint] = [1.0, 0.75].map(|share| percentile(&known, share * strength.percentile));
-        let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, largest)).collect();
-        let shapes = Shapes { smooth, largest, at };
+        let spline = Spline::through(&smooth, self.size);
+        let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, &spline, node, largest)).collect();
+        let shapes = Shapes { smooth, spline, largest, at };
         let [nx, ny] = self.size;
         let mut found = Vec::new();
         for j in 0..ny.saturating_sub(1) {
@@ -138,16 +142,16 @@ impl Field {
         line.windows(2).filter(is_strong).map(|pair| step(0, pair).hypot(step(1, pair))).sum()
     }
 
-    /// Derivatives at a node by central differences.
-    fn shape(&self, field: &[f64], node: usize, largest: f64) -> Option<Shape> {
+    /// The direction across at a node by second differences, and the slope of the spline.
+    fn shape(&self, field: &[f64], spline: &Spline<2>, node: usize, largest: f64) -> Option<Shape> {
         let [nx, ny] = self.size;
         let (i, j) = (node % nx, node / nx);
         if i == 0 || j == 0 || i + 1 >= nx || j + 1 >= ny {
             return None;
         }
-        let near = [node - nx, node, node + nx].map(|row| [field[row - 1], field[row], field[row + 1]]);
+        let is_known = [node - nx, node, node + nx].iter().all(|row| field[row - 1..=row + 1].iter().all(|v| v.is_finite()));
         let [hx, hy] = self.lengths(node);
-        if !(near.iter().flatten().all(|v| v.is_finite()) && hx > 0.0) {
+        if !(is_known && hx > 0.0) {
             return None;
         }
         let mut sum = square(self.hessian(field, node));
@@ -170,8 +174,8 @@ impl Field {
             return None;
         }
         let across = longer.map(|c| c / length);
-        let gradient = [(near[1][2] - near[1][0]) / (2.0 * hx), (near[2][1] - near[0][1]) / (2.0 * hy)];
-        Some(Shape { across, slope: dot(gradient, across) })
+        let [x, y] = spline.gradient([i, j], [0.0; 2]);
+        Some(Shape { across, slope: dot([x / hx, y / hy], across) })
     }
 
     /// Distances of nodes in the row of a node.
@@ -207,40 +211,35 @@ impl Field {
         pair.iter().all(|(_, point)| point.value >= faint).then_some(pair)
     }
 
-    /// Zero of the slope on a side, by the cubic through four nodes in a row, else linear. `None` if it is no ridge.
+    /// Zero of the slope of the spline on a side, in a direction between those of its ends. `None` if it is no ridge.
     fn crossing(&self, from: [usize; 2], to: [usize; 2], shapes: &Shapes) -> Option<(Edge, RidgePoint)> {
-        let Shapes { smooth, largest, at } = shapes;
+        let Shapes { smooth, spline, largest, at } = shapes;
         let nx = self.size[0];
         let (first, second) = ((from[1] * nx + from[0]), (to[1] * nx + to[0]));
         let (a, b) = (at[first]?, at[second]?);
-        // In the direction of the first node.
-        let slope = |shape: &Shape| shape.slope * dot(shape.across, a.across).signum();
-        let (low, high) = (a.slope, slope(&b));
+        let sign = dot(b.across, a.across).signum();
+        let (low, high) = (a.slope, sign * b.slope);
         if (low >= 0.0) == (high >= 0.0) {
             return None;
         }
-        let stride = second as isize - first as isize;
-        let beyond = |node: isize| {
-            let shape = usize::try_from(node).ok().and_then(|node| at.get(node)).copied().flatten()?;
-            (dot(shape.across, a.across).abs() > 0.5).then(|| slope(&shape))
-        };
-        let t = match (beyond(first as isize - stride), beyond(second as isize + stride)) {
-            (Some(before), Some(after)) => cubic_zero([before, low, high, after]),
-            _ => low / (low - high),
-        };
-        let between = |a: f64, b: f64| a + t * (b - a);
+        let between = |t: f64, a: f64, b: f64| a + t * (b - a);
+        // Differences first, since most crossings are those of valleys.
+        let (about, rounding) = (low / (low - high), self.rounding(first, *largest));
         let [near, far] = [first, second].map(|node| self.hessian(smooth, node));
-        let hessian = [0, 1, 2].map(|k| between(near[k], far[k]));
-        let [smaller, larger] = eigenvalues(hessian);
-        // Nodes take their directions from their neighbours too: the field may have a minimum across.
-        let [xx, xy, yy] = hessian;
-        let [x, y] = a.across;
-        let is_highest = x * x * xx + 2.0 * x * y * xy + y * y * yy < 0.0;
-        if !is_highest || smaller >= -self.rounding(first, *largest) || smaller + larger > 0.0 {
-            return None;
-        }
-        let place = [0, 1].map(|k| self.origin[k] + self.step[k] * between(from[k] as f64, to[k] as f64));
-        let point = RidgePoint { place, value: between(smooth[first], smooth[second]), sharpness: -smaller };
+        sharpness([0, 1, 2].map(|k| between(about, near[k], far[k])), a.across, rounding)?;
+        let at = |t: f64| [0, 1].map(|k| between(t, from[k] as f64, to[k] as f64));
+        // Two corners of one cell.
+        let cell = [0, 1].map(|k| from[k].min(to[k]));
+        let within = |t: f64| [0, 1].map(|k| at(t)[k] - cell[k] as f64);
+        let [hx, hy] = self.lengths(first);
+        let t = zero(low, high, |t| {
+            let [x, y] = spline.gradient(cell, within(t));
+            dot([x / hx, y / hy], [0, 1].map(|k| between(t, a.across[k], sign * b.across[k])))
+        });
+        let exact = spline.at(cell, within(t));
+        let [[xx, xy], [_, yy]] = exact.hessian;
+        let sharpness = sharpness([xx / (hx * hx), xy / (hx * hy), yy / (hy * hy)], a.across, rounding)?;
+        let place = [0, 1].map(|k| self.origin[k] + self.step[k] * at(t)[k]);
         // Along x, along y, and the diagonal.
         let kind = if from[1] == to[1] {
             0
@@ -249,8 +248,17 @@ impl Field {
         } else {
             2
         };
-        Some((3 * first.min(second) as Edge + kind, point))
+        Some((3 * first.min(second) as Edge + kind, RidgePoint { place, value: exact.value, sharpness }))
     }
+}
+
+/// Minus the smaller eigenvalue, if it is negative beyond rounding, and the larger one by magnitude, and there is no minimum across: nodes take their
+/// directions from their neighbours too.
+fn sharpness(hessian: Hessian, [x, y]: [f64; 2], rounding: f64) -> Option<f64> {
+    let [smaller, larger] = eigenvalues(hessian);
+    let [xx, xy, yy] = hessian;
+    let is_highest = x * x * xx + 2.0 * x * y * xy + y * y * yy < 0.0;
+    (is_highest && smaller < -rounding && smaller + larger <= 0.0).then_some(-smaller)
 }
 
 /// Square of a symmetric matrix: its eigenvectors, and squares of its eigenvalues.
@@ -278,18 +286,4 @@ pub(super) fn least_sharpness(of: impl Iterator<Item = f64>, percent: f64) -> f6
     let mut sharpness: Vec<f64> = if percent > 0.0 { of.collect() } else { Vec::new() };
     sharpness.par_sort_unstable_by(f64::total_cmp);
     if sharpness.is_empty() { f64::NEG_INFINITY } else { percentile(&sharpness, percent) }
-}
-
-/// Zero in [0, 1] of the cubic through values at -1, 0, 1 and 2, which has opposite signs at 0 and 1.
-pub(super) fn cubic_zero([before, low, high, after]: [f64; 4]) -> f64 {
-    let cubic = |t: f64| {
-        -before * t * (t - 1.0) * (t - 2.0) / 6.0 + low * (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 - high * (t + 1.0) * t * (t - 2.0) / 2.0
-            + after * (t + 1.0) * t * (t - 1.0) / 6.0
-    };
-    let (mut left, mut right) = (0.0, 1.0);
-    for _ in 0..40 {
-        let middle = (left + right) / 2.0;
-        if (cubic(middle) >= 0.0) == (low >= 0.0) { left = middle } else { right = middle }
-    }
-    (left + right) / 2.0
 }

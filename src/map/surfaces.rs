@@ -3,11 +3,12 @@
 //!
 //! With g the gradient, H the Hessian and e its unit eigenvector of the smallest eigenvalue: g . e = 0, and that eigenvalue is negative and the largest
 //! one by magnitude. Cells are cut into six tetrahedra around a diagonal, whose corners agree on the sign of the direction across (Furst and Pizer, Marching
-//! ridges, 2001), which on the flanks of a ridge is that of H squared with a share of the neighbours'. The eigenvalues are tested at the crossing.
+//! ridges, 2001), which on the flanks of a ridge is that of H squared with a share of the neighbours'. The crossing is that of the spline through the nodes,
+//! where the eigenvalues are tested.
 //! The place of a crossing depends on its edge alone, so that tetrahedra meet in shared vertices without gaps.
 
 use super::pieces::pieces;
-use super::ridges::{Strength, cubic_zero, least_sharpness, percentile};
+use super::ridges::{Strength, least_sharpness, percentile};
 use super::volume::{Shape, Shapes, Volume};
 use crate::progress::Work;
 use rayon::prelude::*;
@@ -186,7 +187,11 @@ impl Volume {
                 if number != NEW {
                     return (number != NONE).then_some(number);
                 }
-                let point = self.crossing(node(from), node(to), p ^ q, shapes).filter(|point| point.value >= faint);
+                let found = self.crossing(shapes, [node(from), node(to)], p ^ q).filter(|[_, value, _]| *value >= faint);
+                let point = found.map(|[t, value, sharpness]| {
+                    let along = |k: usize| self.place(node(from))[k] as f64 + if (p ^ q) >> k & 1 == 1 { t } else { 0.0 };
+                    SurfacePoint { place: std::array::from_fn(|k| self.origin[k] + self.step[k] * along(k)), value, sharpness }
+                });
                 // Seven edges a node, of at most 2^25 nodes.
                 slab.numbers[from >> 2][place] = if point.is_some() { slab.points.len() as u32 } else { NONE };
                 slab.points.extend(point);
@@ -204,28 +209,6 @@ impl Volume {
                 }
             }
         }
-    }
-
-    /// Zero of the slope on an edge, by the cubic through four nodes in a row, else linear. `None` if it is no ridge.
-    fn crossing(&self, from: usize, to: usize, axes: usize, shapes: &Shapes) -> Option<SurfacePoint> {
-        let (a, b) = (shapes.at[from].as_ref()?, shapes.at[to].as_ref()?);
-        let (low, high) = (a.slope, slope(b, a));
-        let stride = to - from;
-        // Beyond faces of the grid, nodes in a row belong to other rows; but nodes on faces have no shape.
-        let beyond = |node: Option<usize>| {
-            let shape = shapes.at.get(node?)?.as_ref()?;
-            (dot(shape.across, a.across).abs() > 0.5).then(|| slope(shape, a))
-        };
-        let t = match (beyond(from.checked_sub(stride)), beyond(Some(to + stride))) {
-            (Some(before), Some(after)) => cubic_zero([before, low, high, after]),
-            _ => low / (low - high),
-        };
-        let sharpness = self.sharpness(shapes, [from, to], a.across, t)?;
-        let [nx, ny, _] = self.size;
-        let start = [from % nx, from / nx % ny, from / (nx * ny)];
-        let place = std::array::from_fn(|k| self.origin[k] + self.step[k] * (start[k] as f64 + if axes >> k & 1 == 1 { t } else { 0.0 }));
-        let value = shapes.smooth[from] + t * (shapes.smooth[to] - shapes.smooth[from]);
-        Some(SurfacePoint { place, value, sharpness })
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::ridges::NEIGHBOUR;
 use super::smoothing::smoothed;
+use super::spline::{Derivatives, Spline, zero};
 use rayon::prelude::*;
 
 /// A field on a regular grid in space, x fastest. Values that are not finite are missing.
@@ -31,9 +32,10 @@ pub(super) struct Shape {
     pub(super) slope: f64,
 }
 
-/// The smoothed field, and its shape at each node. `None` at faces of the grid, beside missing nodes, and where the field is flat within rounding.
+/// The smoothed field, the spline through it, and its shape at each node. `None` at faces of the grid, beside missing nodes, and where the field is flat within rounding.
 pub(super) struct Shapes {
     pub(super) smooth: Vec<f64>,
+    spline: Spline<3>,
     pub(super) at: Vec<Option<Shape>>,
     /// Rounding of the smoothed field.
     rounding: f64,
@@ -44,23 +46,50 @@ impl Volume {
         let smooth = smoothed(&self.values, &self.size, smoothing);
         let largest = smooth.par_iter().map(|v| v.abs()).filter(|v| v.is_finite()).reduce(|| 0.0, f64::max);
         let rounding = (1e-5 * largest).max(self.rounding);
-        let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, node, rounding)).collect();
-        Shapes { smooth, at, rounding }
+        let spline = Spline::through(&smooth, self.size);
+        let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, &spline, node, rounding)).collect();
+        Shapes { smooth, spline, at, rounding }
     }
 
-    /// Sharpness, minus the smallest eigenvalue of the Hessian, at the share `t` of the way between two nodes with shapes. `None` unless that eigenvalue
-    /// is negative beyond rounding, and the largest by magnitude, and the field has no minimum across.
-    pub(super) fn sharpness(&self, shapes: &Shapes, [from, to]: [usize; 2], across: [f64; 3], t: f64) -> Option<f64> {
-        let [a, b] = [from, to].map(|node| self.hessian(&shapes.smooth, node, self.lengths(node)));
-        let hessian: [[f64; 3]; 3] = std::array::from_fn(|k| std::array::from_fn(|l| a[k][l] + t * (b[k][l] - a[k][l])));
+    /// Minus the smallest eigenvalue of a Hessian between two nodes with shapes. `None` unless that eigenvalue is negative beyond rounding, and the
+    /// largest by magnitude, and the field has no minimum across.
+    fn sharpness(&self, hessian: [[f64; 3]; 3], across: [f64; 3], h: [f64; 3], rounding: f64) -> Option<f64> {
         if (0..9).map(|n| across[n / 3] * hessian[n / 3][n % 3] * across[n % 3]).sum::<f64>() >= 0.0 {
             return None;
         }
         let (values, vectors) = eigen(hessian);
         let smallest = (0..3).min_by(|k, l| values[*k].total_cmp(&values[*l]))?;
-        let noise = noise(shapes.rounding, column(&vectors, smallest), self.lengths(from));
+        let noise = noise(rounding, column(&vectors, smallest), h);
         let is_ridge = values[smallest] < -noise && values.iter().all(|value| *value <= -values[smallest]);
         is_ridge.then_some(-values[smallest])
+    }
+
+    /// Zero of the slope of the spline between two nodes with shapes, in a direction between those of the nodes: the share of the way, the value and the
+    /// sharpness there. `axes`: those along which the nodes differ, as bits. `None` if it is no ridge of the spline, or none of second differences: beside
+    /// ridges as narrow as a node the spline swings, and would have ridges that the nodes have not.
+    pub(super) fn crossing(&self, shapes: &Shapes, [from, to]: [usize; 2], axes: usize) -> Option<[f64; 3]> {
+        let (a, b) = (shapes.at[from].as_ref()?, shapes.at[to].as_ref()?);
+        let (h, sign) = (self.lengths(from), (0..3).map(|k| a.across[k] * b.across[k]).sum::<f64>().signum());
+        let (low, high) = (a.slope, sign * b.slope);
+        // Differences first, since most crossings are those of valleys.
+        let (about, ends) = (low / (low - high), [from, to].map(|node| self.hessian(&shapes.smooth, node, h)));
+        let between = |k: usize, l: usize| ends[0][k][l] + about * (ends[1][k][l] - ends[0][k][l]);
+        self.sharpness(std::array::from_fn(|k| std::array::from_fn(|l| between(k, l))), a.across, h, shapes.rounding)?;
+        let cell = self.place(from);
+        let within = |t: f64| std::array::from_fn(|k| if axes >> k & 1 == 1 { t } else { 0.0 });
+        let t = zero(low, high, |t| {
+            let gradient = shapes.spline.gradient(cell, within(t));
+            (0..3).map(|k| gradient[k] / h[k] * (a.across[k] + t * (sign * b.across[k] - a.across[k]))).sum()
+        });
+        let Derivatives { value, hessian, .. } = shapes.spline.at(cell, within(t));
+        let exact = std::array::from_fn(|k| std::array::from_fn(|l| hessian[k][l] / (h[k] * h[l])));
+        Some([t, value, self.sharpness(exact, a.across, h, shapes.rounding)?])
+    }
+
+    /// Numbers of a node along x, y and z.
+    pub(super) fn place(&self, node: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.size;
+        [node % nx, node / nx % ny, node / (nx * ny)]
     }
 
     /// Distances of nodes in the row of a node.
@@ -69,10 +98,10 @@ impl Volume {
         std::array::from_fn(|k| self.step[k] * self.scale[row][k])
     }
 
-    /// Derivatives at a node by central differences.
-    fn shape(&self, field: &[f64], node: usize, rounding: f64) -> Option<Shape> {
+    /// The direction across at a node by second differences, and the slope of the spline.
+    fn shape(&self, field: &[f64], spline: &Spline<3>, node: usize, rounding: f64) -> Option<Shape> {
         let [nx, ny, _] = self.size;
-        let at = [node % nx, node / nx % ny, node / (nx * ny)];
+        let at = self.place(node);
         if (0..3).any(|k| at[k] == 0 || at[k] + 1 >= self.size[k]) {
             return None;
         }
@@ -100,8 +129,8 @@ impl Volume {
         if values[largest] <= noise(rounding, across, h).powi(2) {
             return None;
         }
-        let gradient = |k: usize| (field[node + self.stride(k)] - field[node - self.stride(k)]) / (2.0 * h[k]);
-        let slope: f64 = (0..3).map(|k| gradient(k) * across[k]).sum();
+        let gradient = spline.gradient(at, [0.0; 3]);
+        let slope: f64 = (0..3).map(|k| gradient[k] / h[k] * across[k]).sum();
         Some(Shape { across, slope: if slope == 0.0 { f64::MIN_POSITIVE } else { slope } })
     }
 
