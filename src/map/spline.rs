@@ -102,8 +102,7 @@ fn filter(row: &mut [f64]) {
     // Second differences at the ends, of third and, in rows of three, of first order.
     let [first, last] = match *row {
         [a, b, c] => [a - 2.0 * b + c; 2],
-        [a, b, c, d] => [2.0 * a - 5.0 * b + 4.0 * c - d, 2.0 * d - 5.0 * c + 4.0 * b - a],
-        [a, b, c, d, .., e, f, g, h] => [2.0 * a - 5.0 * b + 4.0 * c - d, 2.0 * h - 5.0 * g + 4.0 * f - e],
+        [a, b, c, d, ..] => [2.0 * a - 5.0 * b + 4.0 * c - d, 2.0 * row[n - 1] - 5.0 * row[n - 2] + 4.0 * row[n - 3] - row[n - 4]],
         _ => return,
     };
     row[0] -= first / 6.0;
