@@ -9,7 +9,7 @@ use axum::http::header::CONTENT_TYPE;
 use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
 /// Pictures and lists that are read or on their way at once.
-const MAX_READS: usize = 2;
+const MAX_READS: usize = 1;
 /// Longest wait for one of these places.
 const READ_WAIT: Duration = Duration::from_secs(4);
 /// Records of a list.
@@ -91,15 +91,24 @@ fn open(folder: &Path) -> Result<PastRun, Refusal> {
     })
 }
 
+/// What a record tells of its frame.
+#[derive(Deserialize)]
+struct First {
+    frame: u64,
+}
+
 fn list(folder: &Path) -> Result<Vec<u8>, Refusal> {
     // Before the first frame.
     let Ok(past) = open(folder) else { return Ok(br#"{"frames":[],"records":[]}"#.to_vec()) };
-    let kept: Vec<u64> = past.kept().collect();
+    let records = past.some_records(LISTED_RECORDS).map_err(|error| unreadable(&error))?;
+    // Pictures may be kept for longer than records; without them they are not shown.
+    let first = records.first().and_then(|record| serde_json::from_str::<First>(record).ok()).map_or(u64::MAX, |first| first.frame);
+    let kept: Vec<u64> = past.kept().filter(|frame| *frame >= first).collect();
     let step = kept.len().div_ceil(LISTED_FRAMES).max(1);
     let frames: Vec<u64> = kept.into_iter().rev().step_by(step).collect();
     let numbers = frames.iter().rev().map(u64::to_string).collect::<Vec<_>>().join(",");
     let mut json = format!(r#"{{"frames":[{numbers}],"records":["#);
-    for (number, record) in past.some_records(LISTED_RECORDS).map_err(|error| unreadable(&error))?.into_iter().enumerate() {
+    for (number, record) in records.into_iter().enumerate() {
         if json.len() + record.len() > MAX_LIST_BYTES {
             break;
         }

@@ -99,6 +99,9 @@ pub struct Dashboard {
     thread: Option<JoinHandle<()>>,
 }
 
+/// Threads that decode, encode and read files. Pictures of the past take one of them at most, so that the newest one does not wait.
+const BLOCKING_THREADS: usize = 4;
+
 impl Dashboard {
     /// Listens, and begins to follow the publisher, which need not exist yet.
     ///
@@ -118,7 +121,7 @@ impl Dashboard {
         let is_beside_run = newest.is_some();
         let shown = Shown { pixels: Pixels::new(newest), history: run.map(History::new), chart: chart.map(Bytes::from), is_beside_run };
         let hub = Arc::new(Hub::new(endpoint.clone(), wheel, shown));
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(2).build()?;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         let listener = {
             let _inside = runtime.enter();
             tokio::net::TcpListener::from_std(listener)?
