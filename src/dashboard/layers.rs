@@ -81,6 +81,9 @@ impl Hub {
         let layers = &self.pixels.layers;
         let mut needed = layers.needed.subscribe();
         loop {
+            if !is_recent(*layers.needed.borrow()) {
+                self.pixels.forget_layers();
+            }
             // Its sender is in the hub.
             let _ = needed.wait_for(|needed| is_recent(*needed)).await;
             let begin = Instant::now();
