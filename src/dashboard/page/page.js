@@ -119,9 +119,10 @@ async function refreshPast() {
   past.busy = false;
 }
 
-function pictureLost(lost, problem) {
-  picture.kept.lose(lost);
-  warnings.hold("past", `The picture of frame ${count(lost.frame)} cannot be shown: ${problem}`, lost.frame);
+function pictureLost(lost, error) {
+  // Of a server that is busy or away it may come later.
+  if (error.isGone) picture.kept.lose(lost);
+  warnings.hold("past", `The picture of frame ${count(lost.frame)} cannot be shown: ${error.message}`, lost.frame);
   showPosition();
 }
 

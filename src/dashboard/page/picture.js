@@ -18,7 +18,7 @@ export function pictureBox(canvas) {
 export class Picture {
   /**
    * `changed(picture)` is called with the picture that is now shown; null if there is none. `ask(frame)` resolves to the header and payload of a picture that
-   * the run keeps; `lost(picture, problem)` is called if it cannot.
+   * the run keeps; `lost(picture, error)` is called if it cannot.
    */
   constructor(canvas, changed, { ask, lost }) {
     Object.assign(this, { canvas, changed, ask, lost });
@@ -39,7 +39,7 @@ export class Picture {
     const picture = { frame: header.frame, elapsed: header.record?.seconds?.elapsed ?? null, header, blob, since: performance.now(), asked: type !== "image/jpeg" };
     const restarted = this.kept.add(picture);
     if (restarted) this.held = false;
-    if (this.held) this.changed(this.shown);
+    if (this.held && this.shown !== null) this.changed(this.shown);
     else this.draw(picture, bitmap);
     bitmap.close();
     return restarted;
@@ -134,8 +134,9 @@ export class Picture {
         // Of the others the run has the pictures.
         for (const other of this.kept.past) if (other !== this.shown && other !== picture) other.blob = null;
       } catch (error) {
-        this.lost(picture, error.message);
+        this.lost(picture, error);
         if (this.wanted === picture) this.wanted = this.shown === picture ? null : this.shown;
+        if (this.shown === null) this.held = false;
       }
     }
     this.fetching = false;

@@ -103,7 +103,7 @@ export function address(path, token, query) {
   return url;
 }
 
-/** Fetches from this server. Throws an error with the server's words. */
+/** Fetches from this server. Throws an error with the server's words; `isGone` if there is nothing at the address, or no more. */
 async function get(url, limit, signal) {
   let answer;
   try {
@@ -115,7 +115,7 @@ async function get(url, limit, signal) {
   if (answer.ok) return answer;
   // A proxy that fails answers with a page of its own.
   const words = answer.headers.get("content-type")?.startsWith("text/plain") ? (await answer.text()).trim() : "";
-  throw new Error(words || `the server answers ${answer.status}`);
+  throw Object.assign(new Error(words || `the server answers ${answer.status}`), { isGone: answer.status === 404 || answer.status === 410 });
 }
 
 /** A function that asks for a plane: resolves to its bytes, and rejects with the server's words. */
