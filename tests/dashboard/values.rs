@@ -269,6 +269,13 @@ fn a_map_in_a_projection_is_a_field_in_its_plane() {
     // Upwards, as the axis; the film is from the top.
     let film = film([8, 8], true);
     assert_eq!(ftle[0], f64::from(film.ftle_mean[7 * 8]));
+    // A pixel beside the domain: no share of it is missing, and none is there.
+    let mut unseen = projected_frame(ProjectionChoice::Polar, cap, [8, 8]).0;
+    let film = Arc::make_mut(&mut unseen.film);
+    (film.ftle_mean[0], film.missing[0]) = (f32::NAN, 0.0);
+    newest.put(unseen);
+    let share = values(&read(), "missing_share");
+    assert!(!(0.0..=1.0).contains(&share[7 * 8]) && share[7 * 8 + 1] >= 0.0, "{share:?}");
     // Beside the cone of a region there is no place.
     newest.put(projected_frame(ProjectionChoice::Lambert, [-20.0, 30.0, 50.0, 72.0], [8, 8]).0);
     let file = read();

@@ -192,7 +192,11 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
     let refused = |error: &dyn std::fmt::Display| NoField::System(error.to_string());
     let folder = tempfile::tempdir().map_err(|error| refused(&error))?;
     let path = folder.path().join("map.nc");
-    let values = [&film.ftle_mean, &film.error, &film.missing].map(|layer| centres.of_layer(layer, film.width));
+    let mut values = [&film.ftle_mean, &film.error, &film.missing].map(|layer| centres.of_layer(layer, film.width));
+    // Beside the domain nothing is known to be there, and nothing to lack.
+    let [ftle, _, missing] = &mut values;
+    let unseen = ftle.iter().zip(missing).filter(|(ftle, missing)| !ftle.is_finite() && **missing == 0.0);
+    unseen.for_each(|(_, missing)| *missing = f64::NAN);
     let write = || -> Result<(), CfError> {
         let mut file = CfFile::create(&path, head)?;
         file.add_pixels(record.time, values.each_ref().map(Vec::as_slice))?;
