@@ -62,8 +62,9 @@ impl MapPlane {
         });
         // Plane per degree of latitude, there.
         const STEP: f64 = 1e-4;
-        let [from, to] = [-0.5, 0.5].map(|share| projection.forward([about[0], about[1] + share * STEP]));
-        let unit = scale[1] * STEP / (to[0] - from[0]).hypot(to[1] - from[1]);
+        let ends = [-0.5, 0.5].map(|share| (about[1] + share * STEP).clamp(domain.min[1], domain.max[1]));
+        let [from, to] = ends.map(|latitude| projection.forward([about[0], latitude]));
+        let unit = scale[1] * (ends[1] - ends[0]) / (to[0] - from[0]).hypot(to[1] - from[1]);
         let middle = projection.forward(about);
         Ok(Some(Self { projection, unit, origin: [0, 1].map(|k| about[k] * scale[k] - unit * middle[k]) }))
     }
@@ -164,6 +165,11 @@ mod tests {
         let plane = of(ProjectionChoice::Lambert).unwrap();
         let seen = plane.place_in(&domain, [-10.0, 60.0]).unwrap();
         assert!((seen[0] + 10.0).abs() < 1e-9 && (seen[1] - 60.0).abs() < 1e-9, "{seen:?}");
+        // At a pole, beyond which there is nothing.
+        let to_the_pole = globe([-25.0, 30.0], [45.0, 90.0]);
+        let camera = CameraSettings { eye: [0.0, 95.0, 6.0], look_at: [0.0, 95.0, 1.0], ..camera.clone() };
+        let plane = MapPlane::new(&to_the_pole, &settings(ProjectionChoice::Lambert), Some(&camera), [1.0; 3]).unwrap().unwrap();
+        assert!(plane.unit > 0.0 && plane.unit.is_finite() && plane.origin.iter().all(|x| x.is_finite()), "{plane:?}");
     }
 
     #[test]

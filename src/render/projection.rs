@@ -116,7 +116,7 @@ impl Projection {
                 "plate_carree, polar",
             ),
             ProjectionKind::Mercator => Ok(Self::Mercator),
-            ProjectionKind::Lambert if south * north <= 0.0 || east - west > 180.0 => {
+            ProjectionKind::Lambert if south < 0.0 && north > 0.0 || east - west > 180.0 => {
                 refused("lambert shows one side of the equator and at most 180 degrees of longitude".into(), "plate_carree, mercator")
             }
             ProjectionKind::Lambert => {
@@ -126,7 +126,7 @@ impl Projection {
                 let factor = first.to_radians().cos() * (n * isometric(first)).exp() / n;
                 Ok(Self::Lambert { middle, parallels: [first, second], n, factor })
             }
-            ProjectionKind::Polar if south * north <= 0.0 => {
+            ProjectionKind::Polar if south < 0.0 && north > 0.0 => {
                 refused("polar shows one side of the equator".into(), "plate_carree, mercator")
             }
             ProjectionKind::Polar => Ok(Self::Polar { middle, pole: latitude.signum() }),

@@ -273,6 +273,9 @@ fn between(nodes: &[f64], value: f64) -> Option<(usize, f64)> {
     if !(nodes[0] - slack..=nodes[nodes.len() - 1] + slack).contains(&value) {
         return None;
     }
+    if nodes.len() == 1 {
+        return Some((0, 0.0));
+    }
     let i = nodes.partition_point(|&node| node <= value).clamp(1, nodes.len() - 1) - 1;
     Some((i, ((value - nodes[i]) / (nodes[i + 1] - nodes[i])).clamp(0.0, 1.0)))
 }

@@ -81,6 +81,8 @@ fn the_region_chooses() {
     assert!(Projection::new(ProjectionKind::Lambert, [0.0, -10.0, 20.0, 10.0]).unwrap_err().to_string().contains("plate_carree"));
     assert!(Projection::new(ProjectionKind::Mercator, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("polar"));
     assert!(Projection::new(ProjectionKind::Polar, [0.0, -10.0, 20.0, 89.0]).unwrap_err().to_string().contains("one side of the equator"));
+    Projection::new(ProjectionKind::Polar, [-180.0, 0.0, 180.0, 90.0]).unwrap();
+    Projection::new(ProjectionKind::Lambert, [0.0, -60.0, 40.0, 0.0]).unwrap();
 }
 
 /// Longitude and latitude in a polar stereographic plane in metres, whose meridian of 0 degrees runs down from the pole.
