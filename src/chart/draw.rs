@@ -286,7 +286,10 @@ fn log(range: Range<f64>) -> Range<f64> {
     let high = range.end.max(1e-30);
     // Twelve decades at most: an error of 0 must not squeeze the rest.
     let low = range.start.max(1e-12 * high);
-    low / 1.6..high * 1.6
+    let (low, high) = (low / 1.6, high * 1.6);
+    let [first, last] = [low.log10().ceil(), high.log10().floor()];
+    // Powers of ten have labels: two of them at least.
+    if last > first { low..high } else { 10f64.powf(low.log10().floor())..10f64.powf(high.log10().ceil()) }
 }
 
 /// Width and height that a label takes, in pixels.
@@ -397,4 +400,17 @@ fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -
         line("pick", &|at| area.draw(&Circle::new(at, 7, BLACK.stroke_width(2))).map_err(plot_error))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::log;
+
+    #[test]
+    fn a_logarithmic_axis_has_two_labels_at_least() {
+        assert_eq!(log(2.3..5.3), 1.0..10.0);
+        assert_eq!(log(0.8..2.0), 0.1..10.0);
+        let wide = log(0.05..20.0);
+        assert!(wide.start > 0.03 && wide.end < 40.0, "{wide:?}");
+    }
 }
