@@ -175,7 +175,9 @@ impl Field {
         }
         let across = longer.map(|c| c / length);
         let [x, y] = spline.gradient([i, j], [0.0; 2]);
-        Some(Shape { across, slope: dot([x / hx, y / hy], across) })
+        // A zero would have the same sign in both directions.
+        let slope = dot([x / hx, y / hy], across);
+        Some(Shape { across, slope: if slope == 0.0 { f64::MIN_POSITIVE } else { slope } })
     }
 
     /// Distances of nodes in the row of a node.
