@@ -16,7 +16,8 @@ function tracedWords({ method, surrogate, traced, traced_share: share, picture_e
 function words(record) {
   const { frame, slide, time, time_unit: unit, date, picture_error: error, device } = record;
   if (frame === undefined) return "";
-  const when = date ?? `t = ${time} ${unit ?? ""}`.trim();
+  // Sums of steps are 0.6000000000000001.
+  const when = date ?? `t = ${Number(time?.toPrecision(12))} ${unit ?? ""}`.trim();
   const stated = error ? `error ${percent(error.rms?.value)} rms, ${decibels(error.psnr?.value)}` : "no error stated";
   return `frame ${frame}, slide ${slide}, ${when}; ${stated}; ${tracedWords(record)}; ${device ?? DASH}`;
 }

@@ -4,7 +4,9 @@
     live = LiveFrames()                        # frames of `--publish`; or LiveFrames("tcp://127.0.0.1:5577")
     live                                       # shows the picture, which follows the run
     live.records[-1]["picture_error"]          # records of the newest frames
-    live.close()                               # ends the connection
+    live.close()                               # ends the connection, and takes the view away; live.picture keeps the last one
+
+Each object has a connection of its own: close the old one before the cell that makes it is run again.
 """
 
 import collections
@@ -54,7 +56,7 @@ class LiveFrames(anywidget.AnyWidget):
         self._reader.start()
 
     def close(self):
-        """Ends the connection; the last picture stays."""
+        """Ends the connection, and takes the view away, as of every widget; the last picture stays in `picture`."""
         self._ended.set()
         if self._reader is not None:
             self._reader.join(timeout=2.0)

@@ -7,7 +7,7 @@ import { REPOSITORY, launch, until } from "./kit.js";
 
 const source = readFileSync(path.join(REPOSITORY, "examples/widget.js"), "utf8");
 const record = {
-  frame: 12, slide: 3, time: 4.5, time_unit: "s", date: null, traced_share: 0.25, device: "cpu",
+  frame: 12, slide: 3, time: 0.6000000000000001, time_unit: "s", date: null, traced_share: 0.25, device: "cpu",
   picture_error: { rms: { value: 0.00912 }, psnr: { value: 40.83 } },
 };
 let browser;
@@ -45,7 +45,7 @@ test("the picture is drawn and acknowledged, and its record told", async () => {
   await until("an answer", () => page.evaluate(() => window.sent.length === 1));
   assert.deepEqual(await page.evaluate(() => window.sent), [{ drawn: 12 }]);
   assert.deepEqual(await page.$eval("#cell img", ({ naturalWidth, naturalHeight }) => [naturalWidth, naturalHeight]), [32, 16]);
-  assert.equal(await page.textContent("#cell div"), "frame 12, slide 3, t = 4.5 s; error 0.912 % rms, 40.8 dB; 25.0 % traced; cpu");
+  assert.equal(await page.textContent("#cell div"), "frame 12, slide 3, t = 0.6 s; error 0.912 % rms, 40.8 dB; 25.0 % traced; cpu");
   await page.evaluate(() => window.model.set({ record: { frame: 13, slide: 3, time: 5, date: "2002-01-03", picture_error: null } }));
   assert.equal(await page.textContent("#cell div"), "frame 13, slide 3, 2002-01-03; no error stated; – traced; –");
   for (const [changes, told] of [
@@ -55,7 +55,7 @@ test("the picture is drawn and acknowledged, and its record told", async () => {
     [{ method: "gated", surrogate: "network", traced: 2552 }, "25.0 % traced"],
   ]) {
     await page.evaluate((set) => window.model.set({ record: set }), { ...record, ...changes });
-    assert.equal(await page.textContent("#cell div"), `frame 12, slide 3, t = 4.5 s; error 0.912 % rms, 40.8 dB; ${told}; cpu`);
+    assert.equal(await page.textContent("#cell div"), `frame 12, slide 3, t = 0.6 s; error 0.912 % rms, 40.8 dB; ${told}; cpu`);
   }
   await page.evaluate(() => window.model.set({ state: "nothing new for 6 s" }));
   assert.match(await page.textContent("#cell"), /nothing new for 6 s/);
