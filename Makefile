@@ -38,9 +38,12 @@ CARGO_FUZZ_VERSION := 0.13.2
 # Checks the dependencies.
 CARGO_DENY := target/cargo-deny
 CARGO_DENY_VERSION := 0.19.0
-# The CF checker, and the table of standard names that it looks words up in.
+# The CF checker, the table of standard names that it looks words up in, and libraries of programs that read exports.
 EXPORTS := target/exports
 CFCHECKER_VERSION := 4.1.0
+# Without what VTK draws by: 105 MB. rasterio brings GDAL.
+VTK_VERSION := 9.4.2
+RASTERIO_VERSION := 1.4.4
 FUZZ_TARGETS := ring message zmtp netcdf checkpoint scene
 FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
@@ -120,7 +123,8 @@ test-reader: packages .venv/installed
 
 $(EXPORTS)/done: Makefile | python-packages
 	$(PYTHON) -m venv $(EXPORTS)/venv
-	$(EXPORTS)/venv/bin/pip install --quiet cfchecker==$(CFCHECKER_VERSION) netCDF4 xarray
+	$(EXPORTS)/venv/bin/pip install --quiet cfchecker==$(CFCHECKER_VERSION) netCDF4 xarray rasterio==$(RASTERIO_VERSION)
+	$(EXPORTS)/venv/bin/pip install --quiet --no-deps vtk==$(VTK_VERSION)
 	$(EXPORTS)/venv/bin/pip install --quiet --no-deps --upgrade --target $(EXPORTS)/tables compliance-checker
 	touch $@
 
