@@ -62,8 +62,12 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     };
     bar.set_draw_target(target);
     let left = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-        // Before the first step it is not known. A text that is not written is not shown.
-        let _ = if state.pos() > 0 { write!(out, "eta {:#} ", HumanDuration(state.eta())) } else { Ok(()) };
+        // Before the first step it is not known, and after the last one there may be other work. A text that is not written is not shown.
+        let _ = if state.pos() > 0 && state.len().is_none_or(|len| state.pos() < len) {
+            write!(out, "eta {:#} ", HumanDuration(state.eta()))
+        } else {
+            Ok(())
+        };
     };
     bar.set_style(with_work(style).with_key("left", left));
     // Keeps its clock running, on a thread, for which indicatif panics if the system refuses one.

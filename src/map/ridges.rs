@@ -10,7 +10,9 @@
 use super::contour::{Edge, Segments};
 use super::smoothing::{is_resolved, smoothed};
 use super::spline::{Spline, zero};
+use crate::progress::Work;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// A field on a regular grid, x fastest. Values that are not finite are missing.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,6 +111,7 @@ type Hessian = [f64; 3];
 impl Field {
     /// Ridge lines.
     pub fn ridges(&self, strength: &Strength) -> Vec<Vec<RidgePoint>> {
+        let (work, done) = (Work::begin("finding ridges"), AtomicUsize::new(0));
         let smooth = smoothed(&self.values, &self.size, strength.smoothing);
         let mut known: Vec<f64> = smooth.iter().copied().filter(|v| v.is_finite()).collect();
         if known.is_empty() {
@@ -120,15 +123,14 @@ impl Field {
         let spline = Spline::through(&smooth, self.size);
         let at = (0..smooth.len()).into_par_iter().map(|node| self.shape(&smooth, &spline, node, largest)).collect();
         let shapes = Shapes { smooth, spline, largest, at };
-        let [nx, ny] = self.size;
-        let mut found = Vec::new();
-        for j in 0..ny.saturating_sub(1) {
-            for i in 0..nx.saturating_sub(1) {
-                for triangle in [[[i, j], [i + 1, j], [i, j + 1]], [[i + 1, j], [i, j + 1], [i + 1, j + 1]]] {
-                    found.extend(self.cut(triangle, &shapes, faint));
-                }
-            }
-        }
+        let [columns, rows] = self.size.map(|nodes| nodes.saturating_sub(1));
+        let row = |j: usize| {
+            let triangles = (0..columns).flat_map(|i| [[[i, j], [i + 1, j], [i, j + 1]], [[i + 1, j], [i, j + 1], [i + 1, j + 1]]]);
+            let found: Vec<[(Edge, RidgePoint); 2]> = triangles.filter_map(|triangle| self.cut(triangle, &shapes, faint)).collect();
+            work.reached(done.fetch_add(1, Ordering::Relaxed) + 1, rows);
+            found
+        };
+        let found: Vec<[(Edge, RidgePoint); 2]> = (0..rows).into_par_iter().flat_map_iter(row).collect();
         let sharp = least_sharpness(found.iter().flatten().map(|(_, point)| point.sharpness), strength.sharpness);
         let mut segments = Segments::new();
         found.into_iter().filter(|ends| ends.iter().all(|(_, point)| point.sharpness >= sharp)).for_each(|ends| segments.add(ends));

@@ -62,9 +62,10 @@ impl MapPlane {
         });
         // Plane per degree of latitude, there.
         const STEP: f64 = 1e-4;
-        let ends = [-0.5, 0.5].map(|share| (about[1] + share * STEP).clamp(domain.min[1], domain.max[1]));
-        let [from, to] = ends.map(|latitude| projection.forward([about[0], latitude]));
-        let unit = scale[1] * (ends[1] - ends[0]) / (to[0] - from[0]).hypot(to[1] - from[1]);
+        // Nothing is beyond a pole.
+        let beside = about[1].min(domain.max[1] - 0.5 * STEP).max(domain.min[1] + 0.5 * STEP);
+        let [from, to] = [-0.5, 0.5].map(|share| projection.forward([about[0], beside + share * STEP]));
+        let unit = scale[1] * STEP / (to[0] - from[0]).hypot(to[1] - from[1]);
         let middle = projection.forward(about);
         Ok(Some(Self { projection, unit, origin: [0, 1].map(|k| about[k] * scale[k] - unit * middle[k]) }))
     }

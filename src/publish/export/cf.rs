@@ -170,6 +170,7 @@ impl CfFile {
             put(&mut error, &placed)?;
             let mut missing = file.add_variable::<f64>("missing_share", &dimensions)?;
             put(&mut missing, &[("long_name", "share of the pixel without a velocity"), ("units", "1")])?;
+            missing.put_attribute("_FillValue", FILL)?;
             put(&mut missing, &placed)?;
             return Ok(());
         }
