@@ -121,7 +121,8 @@ test("the key goes through the layers, each said with its frame and scale, and f
       const { told, hidden, ticks } = await shownNow(page);
       return words.test(told) && !hidden && ticks >= 2;
     });
-    const [frame, over] = [await page.locator("#frame").boundingBox(), await page.locator("#overlay").boundingBox()];
+    // In one moment too: a longer sentence above moves both.
+    const [frame, over] = await page.evaluate(() => ["frame", "overlay"].map((id) => document.getElementById(id).getBoundingClientRect().toJSON()));
     assert.deepEqual(over, frame);
   }
   await page.keyboard.press("o");
