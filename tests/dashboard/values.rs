@@ -24,7 +24,13 @@ use std::time::{Duration, Instant};
 pub fn film([width, height]: [usize; 2], has_error: bool) -> Film {
     let pixels = width * height;
     let layer = |from: f32| (0..pixels).map(|i| from + (i as f32).sqrt()).collect::<Vec<_>>();
-    let mut film = Film { ftle_mean: layer(0.1), traced: layer(1.0), samples: vec![4.0; pixels], ..Film::new(width, height) };
+    let mut film = Film {
+        ftle_mean: layer(0.1),
+        traced: layer(1.0),
+        samples: vec![4.0; pixels],
+        queries: vec![4.0; pixels],
+        ..Film::new(width, height)
+    };
     film.rgba = (0..pixels).map(|i| [i as f32 / 7.0, 1.0 / (i as f32 + 3.0), -0.25, 1.0]).collect();
     film.ftle_mean[1] = f32::NAN;
     film.error = if has_error { layer(1e-3) } else { Vec::new() };
@@ -269,10 +275,10 @@ fn a_map_in_a_projection_is_a_field_in_its_plane() {
     // Upwards, as the axis; the film is from the top.
     let film = film([8, 8], true);
     assert_eq!(ftle[0], f64::from(film.ftle_mean[7 * 8]));
-    // A pixel beside the domain: no share of it is missing, and none is there.
+    // A pixel without a seed in the domain.
     let mut unseen = projected_frame(ProjectionChoice::Polar, cap, [8, 8]).0;
     let film = Arc::make_mut(&mut unseen.film);
-    (film.ftle_mean[0], film.missing[0]) = (f32::NAN, 0.0);
+    (film.ftle_mean[0], film.queries[0]) = (f32::NAN, 0.0);
     newest.put(unseen);
     let share = values(&read(), "missing_share");
     assert!(!(0.0..=1.0).contains(&share[7 * 8]) && share[7 * 8 + 1] >= 0.0, "{share:?}");

@@ -163,7 +163,9 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
     }
     // Another program may have sent it.
     let pixels = film.width.saturating_mul(film.height);
-    if record.size != [film.width, film.height] || [&film.ftle_mean, &film.error, &film.missing].iter().any(|layer| layer.len() != pixels) {
+    if record.size != [film.width, film.height]
+        || [&film.ftle_mean, &film.error, &film.missing, &film.queries].iter().any(|layer| layer.len() != pixels)
+    {
         return Err(NoField::Missing("the frame lacks the FTLE, its error or the missing share of some pixels".into()));
     }
     let centres = Centres::of(record).map_err(|why| NoField::Missing(format!("the frame is no field on axes: {why}")))?;
@@ -192,11 +194,9 @@ pub fn map_netcdf(frame: &Frame, about: &MapAbout, run: &str) -> Result<Vec<u8>,
     let refused = |error: &dyn std::fmt::Display| NoField::System(error.to_string());
     let folder = tempfile::tempdir().map_err(|error| refused(&error))?;
     let path = folder.path().join("map.nc");
-    let mut values = [&film.ftle_mean, &film.error, &film.missing].map(|layer| centres.of_layer(layer, film.width));
-    // Beside the domain nothing is known to be there, and nothing to lack.
-    let [ftle, _, missing] = &mut values;
-    let unseen = ftle.iter().zip(missing).filter(|(ftle, missing)| !ftle.is_finite() && **missing == 0.0);
-    unseen.for_each(|(_, missing)| *missing = f64::NAN);
+    // Of pixels without a seed in the domain it is not known what is missing.
+    let missing = film.missing.iter().zip(&film.queries).map(|(missing, seeds)| if *seeds > 0.0 { *missing } else { f32::NAN }).collect();
+    let values = [&film.ftle_mean, &film.error, &missing].map(|layer| centres.of_layer(layer, film.width));
     let write = || -> Result<(), CfError> {
         let mut file = CfFile::create(&path, head)?;
         file.add_pixels(record.time, values.each_ref().map(Vec::as_slice))?;
