@@ -190,6 +190,9 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
         variable.put_values(&points.iter().map(|p| p.place[axis]).collect::<Vec<_>>(), ..)?;
         variable.put_attribute("axis", ["X", "Y"][axis])?;
         variable.put_attribute("long_name", about.axes[axis][0].as_str())?;
+        if about.is_geographic {
+            variable.put_attribute("standard_name", ["longitude", "latitude"][axis])?;
+        }
         variable.put_attribute(
             "units",
             if about.is_geographic { ["degrees_east", "degrees_north"][axis].to_owned() } else { unit(&about.axes[axis][1]) },

@@ -103,9 +103,11 @@ impl SlideMaps {
             ridge_grid: None,
         };
         let mut attempt = Attempt::begin(next);
-        let work = Work::begin("drawing the map of the slide");
+        let mut work = Some(Work::begin("drawing the map of the slide"));
         let mut goes_on = |done: u64, all: u64| {
-            work.reached_share(done as f64 / all as f64);
+            // What comes after the seeds tells of itself.
+            work = work.take().filter(|_| done < all);
+            work.iter().for_each(|work| work.reached_share(done as f64 / all as f64));
             !stop.load(Ordering::Relaxed) && attempt.may_go_on(&self.pace)
         };
         let made = if goes_on(0, 1) { make(&moment, &options, &self.device, &mut goes_on) } else { Err(MapError::Stopped) };
