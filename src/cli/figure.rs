@@ -46,7 +46,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let Some(frame) = options.frame.or_else(|| past.kept().next_back()) else {
         bail!("{} keeps no pictures: there is nothing to draw", run.display());
     };
-    if !past.kept().any(|kept| kept == frame) {
+    if !past.keeps(frame) {
         bail!(Usage(format!("--frame {frame}: its picture is not in {}; accepted: {}", run.display(), ranges(past.kept()))));
     }
     let Some(record) = past.record(frame)? else {

@@ -132,10 +132,10 @@ struct Head<'a> {
 
 fn picture(folder: &Path, frame: u64, tone_map: [f64; 3]) -> Result<Bytes, Refusal> {
     let past = open(folder)?;
-    let record = past.find_record(frame).map_err(|error| unreadable(&error))?;
+    let record = past.record(frame).map_err(|error| unreadable(&error))?;
     let record = record.ok_or_else(|| (StatusCode::NOT_FOUND, format!("the run has no frame {frame} in its records")))?;
     let gone = || (StatusCode::GONE, format!("the run has no picture of frame {frame} any more: it keeps its newest (publish.keep)"));
-    if !past.kept().any(|kept| kept == frame) {
+    if !past.keeps(frame) {
         return Err(gone());
     }
     let [width, height] = record.size;
@@ -145,7 +145,7 @@ fn picture(folder: &Path, frame: u64, tone_map: [f64; 3]) -> Result<Bytes, Refus
     let picture = match past.picture(&record, tone_map) {
         Ok(picture) => picture,
         // It may have been deleted since the folder was listed.
-        Err(_) if !open(folder)?.kept().any(|kept| kept == frame) => return Err(gone()),
+        Err(_) if !open(folder)?.keeps(frame) => return Err(gone()),
         Err(error) => return Err(unreadable(&error)),
     };
     let png = picture.png().map_err(|error| unreadable(&error))?;

@@ -22,6 +22,15 @@ pub struct PastRun {
     kept: BTreeMap<u64, PathBuf>,
 }
 
+/// A picture of 8 bits, rows from the top.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Width and height.
+    pub size: [usize; 2],
+    /// R, G, B.
+    pub pixels: Vec<[u8; 3]>,
+}
+
 impl Picture {
     /// Least width of a picture with a strip below (`--annotate`), so that words have room.
     pub const LEAST_WIDTH: usize = 320;
@@ -33,15 +42,6 @@ impl Picture {
     pub fn png(&self) -> Result<Vec<u8>, ImageError> {
         png_of(self.pixels.as_flattened(), self.size)
     }
-}
-
-/// A picture of 8 bits, rows from the top.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Picture {
-    /// Width and height.
-    pub size: [usize; 2],
-    /// R, G, B.
-    pub pixels: Vec<[u8; 3]>,
 }
 
 #[derive(Deserialize)]
@@ -152,45 +152,16 @@ impl PastRun {
         self.kept.keys().copied()
     }
 
-    /// The record of a frame. `None` if the records that are left do not have it.
-    ///
-    /// # Errors
-    /// Records that cannot be read.
-    pub fn record(&self, frame: u64) -> Result<Option<FrameRecord>, PublishError> {
-        for name in [RECORDS, OLDER_RECORDS] {
-            let path = self.path.join(name);
-            let failed = |problem: String| PublishError::File { path: path.clone(), problem };
-            let file = match crate::files::open(&path) {
-                Ok(file) => file,
-                Err(error) if name == OLDER_RECORDS && error.kind() == std::io::ErrorKind::NotFound => continue,
-                Err(error) => return Err(failed(format!("cannot be read: {error}"))),
-            };
-            let mut reader = BufReader::new(file);
-            let mut line = Vec::new();
-            for number in 1.. {
-                line.clear();
-                let length = (&mut reader)
-                    .take(MAX_LINE_BYTES)
-                    .read_until(b'\n', &mut line)
-                    .map_err(|error| failed(format!("cannot be read: {error}")))?;
-                if length == 0 {
-                    break;
-                }
-                // A line that a full disk or a kill cut short is none.
-                if serde_json::from_slice(&line).is_ok_and(|found: Numbered| found.frame == frame) {
-                    let record = serde_json::from_slice(&line).map_err(|error| failed(format!("line {number} is no record: {error}")))?;
-                    return Ok(Some(record));
-                }
-            }
-        }
-        Ok(None)
+    /// Whether the picture of a frame is kept.
+    pub fn keeps(&self, frame: u64) -> bool {
+        self.kept.contains_key(&frame)
     }
 
     /// The record of a frame, found among records in the order of their frames, of which few are read. `None` if the records that are left do not have it.
     ///
     /// # Errors
     /// Records that cannot be read.
-    pub fn find_record(&self, frame: u64) -> Result<Option<FrameRecord>, PublishError> {
+    pub fn record(&self, frame: u64) -> Result<Option<FrameRecord>, PublishError> {
         for mut lines in self.lines()?.into_iter().rev() {
             let (mut low, mut high) = (0, lines.length);
             while low < high {

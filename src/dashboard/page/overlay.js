@@ -1,12 +1,11 @@
 // A layer of the newest frame over its picture, with its scale.
 import { paint, showTicks } from "./colour_bar.js";
 import { paintPlane, parsePlane, spread, viridis } from "./plane.js";
+import { LATER } from "./values.js";
 import { count, number } from "./words.js";
 
 // Between two planes, so that they leave room for pictures.
 const SPACING = 100;
-// The same where that of a later frame is on its way.
-const LATER = 1000;
 const COLOURS = Array.from({ length: 64 }, (_, k) => viridis(k / 63));
 
 // What each layer is called, and its range of colours; `zero` tells whether 0 is drawn.

@@ -4,8 +4,8 @@ import { count, duration, number, percent, withUnit } from "./words.js";
 
 // Between two questions, so that a pointer on its way asks little.
 const SPACING = 50;
-// Until the next one, where the values of a later frame are on their way.
-const LATER = 1_000;
+// Until the next one, where the layers of a later frame are on their way.
+export const LATER = 1_000;
 const LIMIT = 5_000;
 const PLANE_LIMIT = 30_000;
 const DOWNLOAD_LIMIT = 600_000;
