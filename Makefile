@@ -246,9 +246,10 @@ install-adapters: adapters
 	install -m 644 $$(ls $(ADAPTERS)/include/*.h $(ADAPTERS)/include/*.mod 2>/dev/null) $(DESTDIR)$(PREFIX)/include/
 	sed -e 's|@PREFIX@|$(PREFIX)|' -e 's|@VERSION@|$(VERSION)|' adapters/c/ridgewatch.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/ridgewatch.pc
 
-# Compilers for the tests of the adapters; installs only missing ones.
+# Compilers for the tests of the adapters; installs only missing ones. Programs that use MPI bring mpicc without the headers that it needs.
 adapter-packages:
-	@missing=""; command -v gfortran >/dev/null || missing="$$missing gfortran"; command -v mpicc >/dev/null || missing="$$missing openmpi-bin libopenmpi-dev"; \
+	@missing=""; command -v gfortran >/dev/null || missing="$$missing gfortran"; \
+	echo '#include <mpi.h>' | mpicc -fsyntax-only -xc /dev/stdin 2>/dev/null || missing="$$missing openmpi-bin libopenmpi-dev"; \
 	if [ -n "$$missing" ] && command -v apt-get >/dev/null; then \
 	  $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null || echo "could not install$$missing"; fi
 
