@@ -212,6 +212,7 @@ fn refine_on_cpu(
         method: smooth.method,
         sum: smooth.sum,
         samples: frame.samples,
+        budget: smooth.budget,
         number: frame.picture,
         stop: frame.stop,
     };

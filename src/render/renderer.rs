@@ -47,6 +47,10 @@ pub struct RenderStats {
     pub device_seconds: f64,
     /// Wall-clock seconds of the coupled samples of a smooth frame; 0 for other frames.
     pub sample_seconds: f64,
+    /// Wall-clock seconds of the march of a smooth frame on the CPU, within a budget; 0 for other frames.
+    pub march_seconds: f64,
+    /// True if that march goes on, or has taken time of frames to come.
+    pub march_goes_on: bool,
     /// True if `stop` ended the frame early. Unfinished pixels have 0 samples.
     pub stopped: bool,
 }

@@ -9,8 +9,10 @@ const NODES_SHARE: f64 = 0.5;
 /// Seconds that the parts of a smooth frame take.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct FrameCost {
-    /// All but the samples: march, light volume, combination, film.
+    /// All but the samples: march, light volume, combination, film. Without the march if it keeps to a budget.
     rest: f64,
+    /// Share of the time of the samples in what they and the march take.
+    of_samples: f64,
     /// A coupled sample a pixel.
     sample: f64,
     /// A traced point; `None` if none was traced.
@@ -23,7 +25,9 @@ impl FrameCost {
         let points = tally.traced + stats.speculative_queries;
         let is_measured = points > 0 && tally.trace_seconds > 0.0;
         Self {
-            rest: (seconds - stats.sample_seconds).max(0.0),
+            rest: (seconds - stats.sample_seconds - stats.march_seconds).max(0.0),
+            // A march that keeps to the budget takes as long as the samples while it goes on.
+            of_samples: if stats.march_goes_on { 0.5 } else { 1.0 },
             sample: (stats.sample_seconds / samples).max(f64::MIN_POSITIVE),
             point: is_measured.then(|| tally.trace_seconds / points as f64),
         }
@@ -39,7 +43,7 @@ impl FrameCost {
 
     /// Samples a pixel of a frame of `budget` seconds, of which `refining` went to nodes of a finer table. Below 0 if nothing is left.
     pub(super) fn samples(&self, budget: f64, refining: f64) -> f64 {
-        (budget - self.rest - refining) / self.sample
+        self.of_samples * (budget - self.rest - refining) / self.sample
     }
 
     /// Nodes of a finer table to trace before such a frame.
@@ -72,6 +76,14 @@ mod tests {
         }
         assert_eq!(cost.nodes(0.03), 0.0, "the rest takes longer");
         assert!(cost.samples(0.03, 0.0) < 0.0);
+    }
+
+    /// What a march that keeps to the budget has taken does not count twice, and gets as much again as the samples.
+    #[test]
+    fn a_march_shares_the_time_with_the_samples() {
+        let stats = |goes_on| RenderStats { sample_seconds: 0.06, march_seconds: 0.5, march_goes_on: goes_on, ..RenderStats::default() };
+        let [marches, ready] = [true, false].map(|goes_on| FrameCost::new(0.6, 2.0, &stats(goes_on), &Tally::default()));
+        assert!((ready.samples(0.1, 0.0) - 2.0).abs() < 1e-9 && (marches.samples(0.1, 0.0) - 1.0).abs() < 1e-9);
     }
 
     #[test]

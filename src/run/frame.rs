@@ -196,7 +196,8 @@ impl Run<'_> {
         let a_sample = backend.nodes_per_sample()[1] * self.render.width * self.render.height;
         let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
         let traced_nodes = if gate_decides(method, surrogate) { (a_sample as f64 * samples) as usize } else { 0 };
-        Ok(Some(Smooth { method, sum: self.plan.scene.render.combine == Combine::Sum, nodes, traced_nodes }))
+        let budget = self.render.budget.map(|milliseconds| 1e-3 * milliseconds);
+        Ok(Some(Smooth { method, sum: self.plan.scene.render.combine == Combine::Sum, nodes, traced_nodes, budget }))
     }
 
     /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame

@@ -61,6 +61,24 @@ fn a_run_with_a_budget_refines_its_table() {
     assert!(took[took.len() / 2] < 1.0, "{took:?}");
 }
 
+/// Marching keeps to a budget in which it has no time for rays in each frame.
+#[test]
+fn a_short_budget_holds_for_the_march_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("run");
+    let keys =
+        ["render.width=96", "render.height=96", "render.budget=60", "time.slides=1", "time.frames_per_slide=16", "time.warmup_frames=1"];
+    ridgewatch([&["replay", &config("abc.toml"), "--out", text(&out), "--device", "cpu"][..], &set(&keys)].concat()).success();
+    let records = records(&out);
+    let mut took: Vec<f64> = records[1..].iter().map(|r| r.seconds.refine + r.seconds.render + r.seconds.trace).collect();
+    took.sort_by(f64::total_cmp);
+    // Twice the budget: the machine may have other work.
+    assert!(took[took.len() / 2] < 0.12, "{took:?}");
+    let error = |record: &FrameRecord| record.picture_error.unwrap();
+    let (first, last) = (error(&records[1]), error(&records[16]));
+    assert!(last.rays_per_pixel >= 2 * first.rays_per_pixel && last.psnr.value > first.psnr.value + 3.0, "it goes on: {first:?}, {last:?}");
+}
+
 /// A picture of many samples in one frame begins with a table that is worth them, and is better for it.
 #[test]
 fn a_single_picture_of_many_samples_has_a_finer_table() {

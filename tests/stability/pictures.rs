@@ -160,8 +160,16 @@ fn marching_too_coarse() {
         let mut picture = Picture::default();
         let (mut stated, mut last) = (0.0, None);
         for number in 0..6 {
-            let round =
-                Refinement { nodes: &nodes, missing: None, method: Method::Marched, sum: false, samples: 2.0, number, stop: &NEVER };
+            let round = Refinement {
+                nodes: &nodes,
+                missing: None,
+                method: Method::Marched,
+                sum: false,
+                samples: 2.0,
+                budget: None,
+                number,
+                stop: &NEVER,
+            };
             let mut answers = Field(|p: [f32; 3]| nodes.at(UnitPoint(p)));
             let (film, _, error) = renderer.refine(&mut picture, &round, &mut answers).unwrap();
             stated = error.march_rms / size;
@@ -255,7 +263,7 @@ fn true_square(film: &Film, [a, b]: &[Film; 2]) -> f64 {
 
 /// A round of `two_level` with this many samples a pixel.
 fn corrected(nodes: &Nodes, samples: f64) -> Refinement<'_> {
-    Refinement { nodes, missing: None, method: Method::TwoLevel, sum: false, samples, number: 0, stop: &NEVER }
+    Refinement { nodes, missing: None, method: Method::TwoLevel, sum: false, samples, budget: None, number: 0, stop: &NEVER }
 }
 
 /// Fails without the floor of half the standard error.

@@ -96,7 +96,7 @@ fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Metho
         let mut last = None;
         for number in 0..rounds {
             let samples = 2.0 * pairs_per_pixel;
-            let round = Refinement { nodes: surrogate, missing: None, method, sum, samples, number, stop: &NEVER };
+            let round = Refinement { nodes: surrogate, missing: None, method, sum, samples, budget: None, number, stop: &NEVER };
             last = renderer.refine(&mut picture, &round, &mut Traced(traced));
         }
         let (film, _, error) = last.unwrap();
@@ -146,7 +146,16 @@ fn errors_of_pixels_hold() {
                 let mut renderer = renderer(WIDTH, 100 + seed);
                 let (mut picture, mut last) = (Picture::default(), None);
                 for number in 0..rounds {
-                    let round = Refinement { nodes: &surrogate, missing: None, method, sum: false, samples: 1.0, number, stop: &NEVER };
+                    let round = Refinement {
+                        nodes: &surrogate,
+                        missing: None,
+                        method,
+                        sum: false,
+                        samples: 1.0,
+                        budget: None,
+                        number,
+                        stop: &NEVER,
+                    };
                     last = renderer.refine(&mut picture, &round, &mut Traced(&traced));
                 }
                 let film = last.unwrap().0;
@@ -177,8 +186,16 @@ fn a_target_is_reached_when_it_is_met() {
         let mut renderer = renderer(WIDTH, 100 + seed);
         let (mut picture, mut early) = (Picture::default(), None);
         for number in 0..400 {
-            let round =
-                Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: false, samples: 1.0, number, stop: &NEVER };
+            let round = Refinement {
+                nodes: &surrogate,
+                missing: None,
+                method: Method::TwoLevel,
+                sum: false,
+                samples: 1.0,
+                budget: None,
+                number,
+                stop: &NEVER,
+            };
             let (film, _, error) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
             let missed = true_square(&film, &exact, |c| 1.0 / (c * c + 0.01)) / MOST;
             if error.relmse.value <= MOST {
@@ -204,8 +221,16 @@ fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
     let mut renderer = renderer(32, 5);
     let mut picture = Picture::default();
     let unbiased = [0, 1].map(|number| {
-        let round =
-            Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: true, samples: 1.0, number, stop: &NEVER };
+        let round = Refinement {
+            nodes: &surrogate,
+            missing: None,
+            method: Method::TwoLevel,
+            sum: true,
+            samples: 1.0,
+            budget: None,
+            number,
+            stop: &NEVER,
+        };
         renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap().2.unbiased
     });
     assert_eq!(unbiased, [false, true]);
@@ -235,7 +260,8 @@ fn a_shrunk_correction_converges_with_its_samples() {
         let error_of = |number: i32| {
             let all = 4_f64.powi(number);
             let (method, samples) = (Method::TwoLevel, if number > 0 { 0.75 * all } else { all });
-            let round = Refinement { nodes: &surrogate, missing: None, method, sum, samples, number: number as u64, stop: &NEVER };
+            let round =
+                Refinement { nodes: &surrogate, missing: None, method, sum, samples, budget: None, number: number as u64, stop: &NEVER };
             let (film, _, stated) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
             assert!((stated.samples_per_pixel / all - 1.0).abs() < 0.05, "{} samples, not {all}", stated.samples_per_pixel);
             true_square(&film, &exact, |_| 1.0).sqrt()

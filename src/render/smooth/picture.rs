@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
-use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR};
+use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
@@ -27,8 +27,9 @@ const LIGHT_VALUES: usize = 1 << 24;
 pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
 /// Pairs of paths that are tracked at a time, which bounds the memory of a round.
 const MAX_PAIRS: usize = 1 << 19;
-/// Seconds of marching that a round may take at least. It may also take as long as its samples.
+/// Seconds of marching that a round may take at least, and the same as a share of the seconds that it has. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
+const MIN_MARCH_SHARE: f64 = 0.25;
 /// Pixels of which one leaves a mark of progress.
 const MARKED: usize = 1 << 10;
 
@@ -44,6 +45,8 @@ pub struct Refinement<'a> {
     pub sum: bool,
     /// Coupled samples per pixel, on average.
     pub samples: f64,
+    /// Seconds that the round should take, if they are limited.
+    pub budget: Option<f64>,
     /// Number that selects the random stream when the picture starts anew.
     pub number: u64,
     /// Setting it ends the round early, without a film; the picture then starts anew.
@@ -65,6 +68,10 @@ pub struct Picture {
     /// Random stream: the number of the round at which it started.
     number: u64,
     march: MarchControl,
+    /// Seconds that marching may take before it waits for the time of further rounds: below 0 it has taken more.
+    credit: f64,
+    /// Seconds of the latest rays, for one a pixel.
+    ray_seconds: Option<f64>,
     light: Option<LightVolume>,
     /// Sums over all rays, per pixel.
     base: Vec<RaySum>,
@@ -91,6 +98,8 @@ impl Picture {
             shows: Some((scene.clone(), inverse_tau, nodes.clone())),
             number,
             march,
+            credit: 0.0,
+            ray_seconds: self.ray_seconds,
             light: None,
             base: vec![RaySum::default(); width * height],
             sums: vec![PairSums::default(); width * height],
@@ -114,11 +123,21 @@ impl Picture {
         let frame = &FrameScene { random: FrameRandom::new(scene.seed, self.number), ..*frame };
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
         let tone_map = ToneMap::new(scene.settings.tone_map);
-        let mut marching = self.march(&medium, tone_map, round);
+        let mut begins = self.march.rays == 0;
+        if let (true, Some(budget)) = (begins, round.budget) {
+            self.march_at_most(budget);
+        }
+        let mut marching = 0.0;
+        if begins || round.budget.is_none() || self.credit >= 0.0 {
+            marching += self.march(&medium, tone_map, round);
+        }
         let sampling = Instant::now();
         let Some(mut stats) = self.sample(&medium, round, wave_flights, answers) else { return self.stopped() };
         stats.sample_seconds = sampling.elapsed().as_secs_f64();
-        let allowed = stats.sample_seconds.max(MIN_MARCH_SECONDS);
+        let least = round.budget.map_or(MIN_MARCH_SECONDS, |budget| MIN_MARCH_SECONDS.min(MIN_MARCH_SHARE * budget));
+        // Without a budget each round is on its own. With one, it pays what earlier ones took.
+        let before = round.budget.map_or(0.0, |_| self.credit.min(0.0));
+        let allowed = before + stats.sample_seconds.max(least);
         let how = match (round.method, round.sum) {
             (Method::Marched, _) => Correction::Left,
             (_, true) => Correction::Summed,
@@ -138,15 +157,32 @@ impl Picture {
             match self.march.decide(others, marching < allowed) {
                 Marching::Enough => break (film, error),
                 Marching::Anew => {
+                    begins = true;
                     self.light = None;
                     self.base.fill(RaySum::default());
                 }
                 Marching::More => {}
             }
+            if round.budget.is_some() {
+                self.march_at_most(allowed - marching);
+            }
             marching += self.march(&medium, tone_map, round);
         };
+        if round.budget.is_some() {
+            (stats.march_seconds, stats.march_goes_on) = (marching, self.march.is_due() || allowed < marching);
+        }
+        // What is needed for a picture at all is not paid back.
+        self.credit = if begins { 0.0 } else { allowed - marching };
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
+    }
+
+    /// As many rays as it had on other nodes, or as many again, may take too long at once.
+    fn march_at_most(&mut self, seconds: f64) {
+        if let Some(each) = self.ray_seconds {
+            let most = (seconds / each) as u64 / PAIR * PAIR;
+            self.march.next_rays = self.march.next_rays.min(most.max(MIN_RAYS));
+        }
     }
 
     /// Ends a round early: rays may be missing, so that nothing of the picture is kept.
@@ -181,6 +217,7 @@ impl Picture {
                 sum.add(&marched(pixel as u32, j));
             }
         });
+        let count = rays.end - rays.start;
         self.march.rays = rays.end;
         let mean = |rays: Range<u64>, ray: &dyn Fn(u64) -> RaySum| {
             let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
@@ -215,7 +252,11 @@ impl Picture {
             pixel.shown = shown(&self.base[pixel.pixel as usize]);
         }
         self.march.audit(compared, tone_map);
-        began.elapsed().as_secs_f64()
+        let seconds = began.elapsed().as_secs_f64();
+        if count > 0 {
+            self.ray_seconds = Some(seconds / count as f64);
+        }
+        seconds
     }
 
     /// Tracks pairs of coupled paths. `None` if `stop` ended it early.
