@@ -217,7 +217,8 @@ fn refine_on_cpu(
         stop: frame.stop,
     };
     let refined = nodes.as_ref().and_then(|nodes| renderer.refine(&mut picture.picture, &round(nodes), &mut router));
-    let (tally, samples) = router.finish()?;
+    let (mut tally, samples) = router.finish()?;
+    tally.untraced_share = (smooth.traced_nodes > 0).then(|| picture.traced.untraced_share());
     if let Some(report) = frame.progress {
         report(1.0);
     }

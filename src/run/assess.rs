@@ -92,8 +92,8 @@ impl Run<'_> {
         if gate_decides(self.render.method, on.surrogate.as_ref())
             && let Some(error) = trusted
         {
-            let evidence = learning.trust.weigh(&error);
-            record.gate_evidence = Some(evidence);
+            let (evidence, frames) = learning.trust.weigh(&error);
+            (record.gate_evidence, record.gate_frames) = (Some(evidence), Some(frames));
             if evidence >= REJECTED {
                 learning.need.restart();
                 record.warnings.push(format!(

@@ -424,6 +424,7 @@ impl Run<'_> {
             traced: tally.traced,
             missing: tally.missing,
             over_budget: tally.over_budget,
+            untraced_share: tally.untraced_share,
             tolerance: self.learning.trust.tolerance(),
             camera: Some(self.renderer.scene().camera.clone()),
             scale: self.renderer.scene().scale,

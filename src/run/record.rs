@@ -84,12 +84,18 @@ pub struct FrameRecord {
     /// every frame since the run began or the gate was last reset. At 20 or above the gate is reset. `None` if nothing is trusted, or if the gate
     /// decides nothing: it does for `gated`, and for `marched` and `two_level` with a network.
     pub gate_evidence: Option<f64>,
+    /// Frames that `gate_evidence` rests on: 1 after each reset.
+    #[serde(default)]
+    pub gate_frames: Option<u64>,
     /// PSNR in decibels of the surrogate over the whole domain, on the audit points; peak: their largest traced log-stretch. `None` for
     /// `reference`.
     #[serde(default)]
     pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
     pub trusted_volume: f64,
+    /// Share of the nodes of a laid out network that show it although it is not trusted there, since they are not traced yet. `None` of other pictures.
+    #[serde(default)]
+    pub untraced_share: Option<f64>,
     /// `trusted_error` on new points with the same weights, measured after the frame (`--verify`).
     pub verified_error: Option<TrustedError>,
     /// Error of the picture, against that of the traced field without noise. `None` if none is stated.

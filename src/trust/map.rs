@@ -170,14 +170,15 @@ impl TrustMap {
         self.evidence.restart();
     }
 
-    /// Adds a frame's measured error to the evidence against the gate, and returns the evidence. At [`REJECTED`] or above the gate
-    /// has promised too much over the run: all residuals are forgotten, so that every cell earns its trust again.
-    pub fn weigh(&mut self, trusted: &TrustedError) -> f64 {
+    /// Adds a frame's measured error to the evidence against the gate, and returns the evidence and the frames that it rests on. At [`REJECTED`] or
+    /// above the gate has promised too much over the run: all residuals are forgotten, so that every cell earns its trust again.
+    pub fn weigh(&mut self, trusted: &TrustedError) -> (f64, u64) {
         let evidence = self.evidence.observe(trusted.optical_rms.powi(2));
+        let frames = self.evidence.frames();
         if evidence >= REJECTED {
             self.reset();
         }
-        evidence
+        (evidence, frames)
     }
 
     /// Upper 95 % bound of the mean square optical residual of a cell; `None` with too few samples.

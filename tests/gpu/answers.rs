@@ -132,10 +132,10 @@ impl Stage {
             queries: stats.queries,
             traced: stats.traced,
             missing: stats.missing,
-            nodes: 0,
             over_budget: side.renderer.over_budget(),
             trace_seconds: routed.trace_seconds(),
             predict_seconds: routed.predict_seconds(),
+            ..Tally::default()
         };
         (film, stats, tally, labels)
     }

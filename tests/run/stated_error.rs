@@ -159,6 +159,10 @@ impl Backend for Corrupting<'_> {
 
 /// Records of a picture that stands still, whose surrogate is corrupted from a frame on.
 fn standing(method: &str, kind: &str, corrupted_from: Option<u64>) -> Vec<FrameRecord> {
+    of_a_picture([32, 16, 4], method, kind, "", corrupted_from)
+}
+
+fn of_a_picture(size: [usize; 3], method: &str, kind: &str, keys: &str, corrupted_from: Option<u64>) -> Vec<FrameRecord> {
     let keys = format!(
         "
         time.tau = 5
@@ -167,10 +171,11 @@ fn standing(method: &str, kind: &str, corrupted_from: Option<u64>) -> Vec<FrameR
         training.steps_per_frame = 100
         render.method = \"{method}\"
         surrogate.kind = \"{kind}\"
+        {keys}
         {}",
         scene::SMALL_NETWORK
     );
-    let setup = scene::setup(&scene::double_gyre([32, 16, 4], &keys), &[]);
+    let setup = scene::setup(&scene::double_gyre(size, &keys), &[]);
     let is_corrupted = AtomicBool::new(corrupted_from == Some(0));
     let mut records = Vec::new();
     let mut sink = |event: Event| {
@@ -194,8 +199,29 @@ fn the_gate_of_a_smooth_picture_is_weighed_if_it_decides_what_is_traced() {
         for record in &records {
             let is_weighed = decides && record.trusted_error.is_some();
             assert_eq!(record.gate_evidence.is_some(), is_weighed, "{method}, {kind}, frame {}", record.frame);
+            assert_eq!(record.untraced_share.is_some(), decides, "{method}, {kind}, frame {}", record.frame);
         }
+        // Each frame counts once. What is not trusted is traced over the pictures, not at once.
+        let frames: Vec<u64> = records.iter().filter_map(|record| record.gate_frames).collect();
+        assert!(frames.iter().zip(1..).all(|(frames, number)| *frames == number), "{method}, {kind}: {frames:?}");
+        let shares: Vec<f64> = records.iter().filter_map(|record| record.untraced_share).collect();
+        assert!(shares.iter().all(|share| (0.0..1.0).contains(share)), "{method}: {shares:?}");
+        assert!(method == "marched" || shares.iter().all(|share| *share == 0.0), "all nodes are traced at once: {shares:?}");
     }
+}
+
+/// A small picture has time for few nodes: until all are traced, records tell how many show a network that nobody trusts, after a slide too.
+#[test]
+fn nodes_that_wait_to_be_traced_are_told() {
+    let keys = "time.slides = 2";
+    let records = of_a_picture([6, 3, 1], "two_level", "network", keys, None);
+    let shares: Vec<f64> = records.iter().map(|record| record.untraced_share.unwrap()).collect();
+    let (before, after) = shares.split_at(8);
+    assert!(before[0] > 0.3 && before.windows(2).all(|pair| pair[1] <= pair[0]) && before[7] < before[0], "{shares:?}");
+    assert!(after[0] > before[7], "the slide closed cells: {shares:?}");
+    // Nodes of cells that are not trusted, and what of others lies in the same bricks.
+    let at_most = |record: &FrameRecord, share: f64| share <= 1.25 * (1.0 - record.trusted_volume);
+    assert!(at_most(&records[0], shares[0]) && at_most(&records[8], shares[8]), "{shares:?}");
 }
 
 #[test]
@@ -210,5 +236,7 @@ fn a_corrupted_network_of_a_smooth_picture_is_found_in_a_frame() {
     let is_said = |record: &FrameRecord| record.warnings.iter().any(|warning| warning.contains("every cell must earn trust again"));
     assert!(found.gate_evidence.unwrap() >= REJECTED && is_said(found) && !is_said(&healthy[first]), "{:?}", found.gate_evidence);
     // A large log-stretch is right only where the transfer function is saturated.
+    let reset = records[first + 1..].iter().find_map(|record| record.gate_frames);
+    assert!(reset.is_none_or(|frames| frames == 1), "the evidence begins anew: {reset:?}");
     assert!(next.trusted_volume < 0.25 * found.trusted_volume, "{} trusted, then {}", found.trusted_volume, next.trusted_volume);
 }

@@ -44,7 +44,7 @@ impl Loop {
         let gate = self.map.gate();
         let audited = self.audit(self.map.audit_strata(&gate, 8), &residual);
         let error = trusted_error(&audited, &gate);
-        let evidence = error.map_or(0.0, |error| self.map.weigh(&error));
+        let evidence = error.map_or(0.0, |error| self.map.weigh(&error).0);
         self.map.decay();
         self.map.observe(Some(&audited), &[]);
         self.frame += 1;
@@ -186,7 +186,7 @@ fn evidence_of_a_gate_that_promises_too_much() {
     // Errors that the map believes to be smaller: audits far above what rendered samples show.
     let mut map = Loop::opened(2, |_, random| skewed(0.3 * TOLERANCE, random)).map;
     let error = |factor: f64| TrustedError { points: 1000, optical_rms: factor * TOLERANCE, ..TrustedError::default() };
-    let frames = |map: &mut TrustMap, factor: f64| (1..=1000).find(|_| map.weigh(&error(factor)) >= REJECTED);
+    let frames = |map: &mut TrustMap, factor: f64| (1..=1000).find(|_| map.weigh(&error(factor)).0 >= REJECTED);
     let mut found = Vec::new();
     for factor in [1.05, 1.1, 1.2, 1.5, 2.0, 4.0] {
         let mut run = map.clone();

@@ -138,6 +138,9 @@ export function windowWords(record) {
   return `${time(record.time)} to ${time(end, record.time_unit)}`;
 }
 
+/** What of the picture rests on a network that is not trusted there. */
+const untracedWords = (record) => (record.untraced_share > 0 ? `; ${percent(record.untraced_share)} of the nodes show a network that is not trusted there` : "");
+
 /** Rows of the table beside the picture: term, text. */
 export function facts(record, header) {
   const estimate = record.picture_error?.psnr;
@@ -152,7 +155,7 @@ export function facts(record, header) {
     size: `${record.size?.join(" × ") ?? DASH} pixels, ${(record.method === "map" && seedWords(record)) || `${number(record.samples_per_pixel)} samples a pixel`}`,
     psnr: interval,
     traced: drawnWords(record) ?? `${percent(record.traced_share)} of ${count(known(record.queries) ? record.queries - (record.missing ?? 0) : null)} queries`,
-    trusted: `${percent(record.trusted_volume)} of the domain`,
+    trusted: `${percent(record.trusted_volume)} of the domain${untracedWords(record)}`,
     seconds: `${number(record.seconds?.total)} s`,
     slide: count(record.slide),
     step: record.live ? `step ${count(record.live.step)}, ${count(record.live.snapshots)} in the window` : DASH,

@@ -99,6 +99,11 @@ impl DeviceBricks {
         Ok(count)
     }
 
+    /// Share of the nodes that show a network which is not trusted there.
+    pub(super) fn untraced_share(&self) -> f64 {
+        self.traced.untraced_share()
+    }
+
     /// Largest value of each brick, faces included.
     fn largest(&self, nodes: NodeGrid<'_>) -> Result<Vec<f32>, DeviceError> {
         let count: usize = brick_shape(nodes.shape()).iter().product();

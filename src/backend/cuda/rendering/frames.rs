@@ -181,6 +181,7 @@ impl GpuFrames {
             traced: stats.traced,
             missing: stats.missing,
             nodes: own.traced_nodes(),
+            untraced_share: own.untraced_share().filter(|_| job.smooth.is_some_and(|smooth| smooth.traced_nodes > 0)),
             trace_seconds,
             ..Tally::default()
         };

@@ -121,6 +121,11 @@ impl GpuSmooth {
         self.traced_nodes
     }
 
+    /// Share of the nodes that show a network which is not trusted there; `None` without bricks.
+    pub(super) fn untraced_share(&self) -> Option<f64> {
+        self.bricks.as_ref().map(DeviceBricks::untraced_share)
+    }
+
     /// Starts anew if the round shows anything else than the picture so far.
     fn settle(&mut self, round: &SmoothRound<'_>, renderer: &mut Renderer, answers: &mut dyn DeviceLogStretch) -> Result<(), DeviceError> {
         self.traced_nodes = 0;
