@@ -2,6 +2,9 @@
 
 use super::ridges::RidgePoint;
 use super::words::Rate;
+use crate::publish::add_mapping;
+use crate::source::GridMapping;
+use netcdf::VariableMut;
 use serde_json::json;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -28,22 +31,38 @@ pub struct RidgesAbout {
     pub when: String,
     /// Unit of tau; empty if it has none.
     pub time_unit: String,
-    /// Unit of the FTLE in the files.
+    /// Unit of the FTLE in GeoJSON and NetCDF, that of the map.
     pub rate: Rate,
     /// True if coordinates are longitudes and latitudes in degrees.
     pub is_geographic: bool,
     /// Names and units of the coordinates.
     pub axes: [[String; 2]; 3],
+    /// Where the horizontal coordinates lie on the globe, if the source tells.
+    pub mapping: Option<GridMapping>,
     /// Third coordinate of lines.
     pub level: f64,
 }
 
 impl RidgesAbout {
-    /// Unit of the sharpness; without a unit of length if the coordinates have none.
-    pub(super) fn sharpness_unit(&self) -> String {
+    /// Unit of the sharpness of a FTLE in `rate`; without a unit of length if the coordinates have none.
+    fn sharpness_unit(&self, rate: &str) -> String {
         let length = if self.is_geographic { "km" } else { self.axes[0][1].as_str() };
         let square = if length.is_empty() { String::new() } else { format!(" {length}-2") };
-        format!("{}{square}", self.rate.unit).trim_start().to_owned()
+        format!("{rate}{square}").trim_start().to_owned()
+    }
+
+    /// Names of facts and their texts, for files of VTK and PLY. Their FTLE is in 1 / time unit of the source, as that of fields in VTK files.
+    pub(super) fn texts(&self) -> impl Iterator<Item = (&'static str, String)> {
+        let axes = self.axes.iter().filter(|[name, _]| !name.is_empty());
+        let axes = axes.map(|[name, unit]| if unit.is_empty() { name.clone() } else { format!("{name} [{unit}]") });
+        let rate = if self.time_unit.is_empty() { String::new() } else { format!("1/{}", self.time_unit) };
+        let texts = [
+            ("coordinates", axes.collect::<Vec<_>>().join(", ")),
+            ("sharpness_unit", self.sharpness_unit(&rate)),
+            ("ftle_unit", rate),
+            ("time_unit", self.time_unit.clone()),
+        ];
+        texts.into_iter().filter(|(_, text)| !text.is_empty())
     }
 }
 
@@ -109,7 +128,7 @@ pub fn geojson(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let features: Vec<_> = features.collect();
     let about = json!({
         "title": about.title, "source": about.source, "seed_time": about.when, "tau_unit": about.time_unit, "ftle_unit": about.rate.unit,
-        "sharpness_unit": about.sharpness_unit(),
+        "sharpness_unit": about.sharpness_unit(&about.rate.unit),
     });
     json!({ "type": "FeatureCollection", "ridgewatch": about, "features": features }).to_string()
 }
@@ -121,11 +140,12 @@ fn figures(line: &RidgeLine, about: &RidgesAbout) -> [f64; 3] {
     [mean(&|p| p.value), largest, mean(&|p| p.sharpness)].map(|v| v * about.rate.factor)
 }
 
-/// Lines as legacy VTK polydata. On the sphere, coordinates are degrees.
+/// Lines as legacy VTK polydata. On the sphere, coordinates are degrees. The FTLE is in 1 / time unit of the source.
 pub fn vtk(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let points: Vec<&RidgePoint> = lines.iter().flat_map(|line| &line.points).collect();
-    let title: String =
-        format!("ridgewatch FTLE ridges, {}, {}", about.title, about.when).chars().filter(|c| *c != '\n').take(200).collect();
+    let facts = [about.title.clone(), about.when.clone()].into_iter().chain(about.texts().map(|(name, text)| format!("{name} {text}")));
+    let facts: Vec<_> = std::iter::once("ridgewatch FTLE ridges".to_owned()).chain(facts).filter(|fact| !fact.is_empty()).collect();
+    let title: String = facts.join(", ").chars().filter(|c| *c != '\n').take(200).collect();
     let mut text = format!("# vtk DataFile Version 3.0\n{title}\nASCII\nDATASET POLYDATA\nPOINTS {} double\n", points.len());
     // Writing to a string does not fail.
     for point in &points {
@@ -153,7 +173,7 @@ pub fn vtk(lines: &[RidgeLine], about: &RidgesAbout) -> String {
         let head = if number == 0 { format!("POINT_DATA {}\n", points.len()) } else { String::new() };
         let _ = writeln!(text, "{head}SCALARS {name} double 1\nLOOKUP_TABLE default");
         for point in &points {
-            let _ = writeln!(text, "{}", about.rate.factor * if number == 0 { point.value } else { point.sharpness });
+            let _ = writeln!(text, "{}", if number == 0 { point.value } else { point.sharpness });
         }
     }
     text
@@ -174,11 +194,18 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
     file.add_dimension("line", lines.len())?;
     file.add_dimension("node", points.len())?;
     let unit = |unit: &str| if unit.is_empty() { "1".to_owned() } else { unit.to_owned() };
+    let placed = |variable: &mut VariableMut| -> Result<(), netcdf::Error> {
+        about.mapping.iter().try_for_each(|mapping| variable.put_attribute("grid_mapping", mapping.name.as_str()).map(drop))
+    };
     {
         let mut container = file.add_variable::<i32>("geometry", &[])?;
         container.put_attribute("geometry_type", "line")?;
         container.put_attribute("node_count", "node_count")?;
         container.put_attribute("node_coordinates", "x y")?;
+        placed(&mut container)?;
+    }
+    if let Some(mapping) = &about.mapping {
+        add_mapping(&mut file, mapping)?;
     }
     {
         let mut counts = file.add_variable::<i32>("node_count", &["line"])?;
@@ -192,6 +219,8 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
         variable.put_attribute("long_name", about.axes[axis][0].as_str())?;
         if about.is_geographic {
             variable.put_attribute("standard_name", ["longitude", "latitude"][axis])?;
+        } else if about.mapping.is_some() {
+            variable.put_attribute("standard_name", ["projection_x_coordinate", "projection_y_coordinate"][axis])?;
         }
         variable.put_attribute(
             "units",
@@ -214,16 +243,14 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
         variable.put_attribute("long_name", long_name)?;
         variable.put_attribute("units", units)?;
         variable.put_attribute("geometry", "geometry")?;
+        placed(&mut variable)?;
     }
-    let rate = about.rate.unit.strip_prefix("1/").map_or("1".to_owned(), |unit| format!("{unit}-1"));
+    let rate = about.rate.unit.strip_prefix("1/").map_or(String::new(), |unit| format!("{unit}-1"));
+    let across = "minus the second derivative of the FTLE across the ridge";
+    let sharpness_unit = unit(&about.sharpness_unit(&rate));
     for (name, long_name, units, of) in [
-        ("ftle", "finite-time Lyapunov exponent", rate.clone(), (|p: &RidgePoint| p.value) as fn(&RidgePoint) -> f64),
-        (
-            "sharpness",
-            "minus the second derivative of the FTLE across the ridge",
-            if about.is_geographic { format!("{rate} km-2") } else { rate },
-            |p| p.sharpness,
-        ),
+        ("ftle", "finite-time Lyapunov exponent", unit(&rate), (|p: &RidgePoint| p.value) as fn(&RidgePoint) -> f64),
+        ("sharpness", across, sharpness_unit, |p| p.sharpness),
     ] {
         let mut variable = file.add_variable::<f64>(name, &["node"])?;
         variable.put_values(&points.iter().map(|p| of(p) * about.rate.factor).collect::<Vec<_>>(), ..)?;

@@ -174,6 +174,7 @@ pub(super) fn about(moment: &Moment, rate: Rate, level: f64) -> RidgesAbout {
         rate,
         is_geographic: is_geographic(&moment.velocity),
         axes: axes(&moment.velocity).map(|(name, unit)| [name, unit]),
+        mapping: moment.plan.georeference.mapping.clone(),
         // As in files of fields, which lie over these.
         level: if moment.plan.domain.dimensions == 2 { 0.0 } else { level },
     }

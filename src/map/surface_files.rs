@@ -25,20 +25,8 @@ impl SurfacesAbout {
     /// One line for people.
     fn line(&self) -> String {
         let RidgesAbout { title, source, when, .. } = &self.shared;
-        format!("{} ridge surfaces of the {} FTLE at {when}: {title}; {source}", structures(self.direction), self.direction.name())
-    }
-
-    /// Names of facts and their texts, for files that state them as texts.
-    fn texts(&self) -> impl Iterator<Item = (&'static str, String)> {
-        let RidgesAbout { rate, axes, time_unit, .. } = &self.shared;
-        let axes = axes.iter().map(|[name, unit]| if unit.is_empty() { name.clone() } else { format!("{name} [{unit}]") });
-        let texts = [
-            ("coordinates", axes.collect::<Vec<_>>().join(", ")),
-            ("ftle_unit", rate.unit.clone()),
-            ("sharpness_unit", self.shared.sharpness_unit()),
-            ("time_unit", time_unit.clone()),
-        ];
-        texts.into_iter().filter(|(_, text)| !text.is_empty())
+        let of = [title.as_str(), source].into_iter().filter(|text| !text.is_empty()).collect::<Vec<_>>().join("; ");
+        format!("{} ridge surfaces of the {} FTLE at {when}: {of}", structures(self.direction), self.direction.name())
     }
 }
 
@@ -83,14 +71,14 @@ impl Surfaces {
     }
 
     fn vtp(&self, about: &SurfacesAbout, out: &mut impl Write) -> io::Result<()> {
-        let (points, triangles, factor) = (self.points.len(), self.triangles.len(), about.shared.rate.factor);
-        let each = |name, of: fn(&SurfacePoint) -> f64| Array::doubles(name, 1, points, self.points.iter().map(move |p| factor * of(p)));
+        let (points, triangles) = (self.points.len(), self.triangles.len());
+        let each = |name, of: fn(&SurfacePoint) -> f64| Array::doubles(name, 1, points, self.points.iter().map(of));
         let mut appended = Appended::default();
         begin(out, "PolyData", &about.line())?;
         writeln!(out, "<PolyData>\n<FieldData>")?;
         let facts = [("TimeValue", about.time), ("integration_time", about.tau), ("direction", about.direction.sign())];
         appended.declare(out, facts.map(|(name, value)| Array::number(name, value)).into(), true)?;
-        about.texts().try_for_each(|(name, fact)| text(out, name, &fact))?;
+        about.shared.texts().try_for_each(|(name, fact)| text(out, name, &fact))?;
         writeln!(
             out,
             "</FieldData>\n<Piece NumberOfPoints=\"{points}\" NumberOfVerts=\"0\" NumberOfLines=\"0\" NumberOfStrips=\"0\" NumberOfPolys=\"{triangles}\">\n\
@@ -114,13 +102,12 @@ impl Surfaces {
         writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment {}", fact(&about.line()))?;
         writeln!(out, "comment written by ridgewatch {}", env!("CARGO_PKG_VERSION"))?;
         writeln!(out, "comment direction {}\ncomment integration_time {}\ncomment time {}", about.direction.name(), about.tau, about.time)?;
-        about.texts().try_for_each(|(name, text)| writeln!(out, "comment {name} {}", fact(&text)))?;
+        about.shared.texts().try_for_each(|(name, text)| writeln!(out, "comment {name} {}", fact(&text)))?;
         writeln!(out, "element vertex {}", self.points.len())?;
         ["x", "y", "z", "ftle", "sharpness"].iter().try_for_each(|name| writeln!(out, "property double {name}"))?;
         writeln!(out, "element face {}\nproperty list uchar int vertex_indices\nproperty int surface\nend_header", self.triangles.len())?;
-        let factor = about.shared.rate.factor;
         for SurfacePoint { place: [x, y, z], value, sharpness } in &self.points {
-            [*x, *y, *z, factor * value, factor * sharpness].iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
+            [*x, *y, *z, *value, *sharpness].iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))?;
         }
         for (triangle, number) in self.triangles.iter().zip(self.numbers()) {
             out.write_all(&[3])?;

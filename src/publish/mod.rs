@@ -26,6 +26,7 @@ mod zmq;
 
 pub use compare::{CompareError, Comparison, compare_files, compare_films};
 pub use error::PublishError;
+pub(crate) use export::add_mapping;
 pub use export::{Field, FieldExport, FieldFormat, FieldFrame, MapAbout, NewestSlide, NoField, SeedField, SlideField, seeds};
 pub use exr::{channels_at, decode_exr, encode_exr, exr_claims, read_exr, write_exr};
 pub use histogram::{Histogram, histogram};

@@ -1,7 +1,7 @@
 //! A field as NetCDF by the CF conventions, of which 1.8 is the newest version that the CF checker knows.
 
 use super::{Field, FieldFrame, Of, STATUS};
-use crate::source::MappingValue;
+use crate::source::{GridMapping, MappingValue};
 use netcdf::{FileMut, Options, VariableMut};
 use std::io;
 use std::path::Path;
@@ -120,14 +120,7 @@ impl CfFile {
             variable.put_attribute("_FillValue", FILL)?;
         }
         if let Some(mapping) = &frame.georeference.mapping {
-            let mut variable = file.add_variable::<i32>(&mapping.name, &[])?;
-            for (name, value) in &mapping.attributes {
-                match value {
-                    MappingValue::Text(text) => variable.put_attribute(name, text.as_str())?,
-                    MappingValue::Numbers(numbers) if numbers.len() == 1 => variable.put_attribute(name, numbers[0])?,
-                    MappingValue::Numbers(numbers) => variable.put_attribute(name, numbers.clone())?,
-                };
-            }
+            add_mapping(file, mapping)?;
         }
 
         let dimensions: Vec<&str> = std::iter::once("time").chain(axes.iter().rev().map(String::as_str)).collect();
@@ -285,6 +278,22 @@ impl CfFile {
 /// Name of the bounds of an axis.
 fn bounds_of(axis: &str) -> String {
     format!("{axis}_bounds")
+}
+
+/// Adds the variable of a grid mapping.
+///
+/// # Errors
+/// libnetcdf fails.
+pub(crate) fn add_mapping(file: &mut FileMut, mapping: &GridMapping) -> Result<(), netcdf::Error> {
+    let mut variable = file.add_variable::<i32>(&mapping.name, &[])?;
+    for (name, value) in &mapping.attributes {
+        match value {
+            MappingValue::Text(text) => variable.put_attribute(name, text.as_str())?,
+            MappingValue::Numbers(numbers) if numbers.len() == 1 => variable.put_attribute(name, numbers[0])?,
+            MappingValue::Numbers(numbers) => variable.put_attribute(name, numbers.clone())?,
+        };
+    }
+    Ok(())
 }
 
 fn put(variable: &mut VariableMut, attributes: &[(&str, &str)]) -> Result<(), netcdf::Error> {

@@ -14,6 +14,7 @@ use crate::run::{Plan, Slide};
 use crate::setting::word;
 use crate::source::Georeference;
 use cf::CfFile;
+pub(crate) use cf::add_mapping;
 pub use pixels::{MapAbout, NoField, map_netcdf};
 pub use seeds::{NewestSlide, SeedField, SlideField, seeds};
 use std::path::{Path, PathBuf};

@@ -128,8 +128,9 @@ impl VtkFiles {
 
         let extent = format!("0 {} 0 {} 0 {}", nx - 1, ny - 1, nz - 1);
         let spacing = |k: usize| axes[k].get(1).map_or(1.0, |second| second - axes[k][0]);
-        let (kind, title) = (self.kind.name(), format!("{}; {}", frame.title, frame.source));
-        begin(out, kind, &format!("{} FTLE of {title}", frame.direction.name()))?;
+        let kind = self.kind.name();
+        let of = [&frame.title, &frame.source].into_iter().filter(|text| !text.is_empty()).cloned().collect::<Vec<_>>().join("; ");
+        begin(out, kind, &format!("{} FTLE of {of}", frame.direction.name()))?;
         write!(out, "<{kind} WholeExtent=\"{extent}\"")?;
         if self.kind == VtkKind::Image {
             let [x, y, z] = [0, 1, 2].map(|k| axes[k][0]);
