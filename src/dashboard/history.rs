@@ -100,24 +100,23 @@ struct First {
 fn list(folder: &Path) -> Result<Vec<u8>, Refusal> {
     // Before the first frame.
     let Ok(past) = open(folder) else { return Ok(br#"{"frames":[],"records":[]}"#.to_vec()) };
-    let records = past.some_records(LISTED_RECORDS).map_err(|error| unreadable(&error))?;
+    let records = thinned(past.some_records(LISTED_RECORDS).map_err(|error| unreadable(&error))?, MAX_LIST_BYTES);
     // Pictures may be kept for longer than records; without them they are not shown.
     let first = records.first().and_then(|record| serde_json::from_str::<First>(record).ok()).map_or(u64::MAX, |first| first.frame);
     let kept: Vec<u64> = past.kept().filter(|frame| *frame >= first).collect();
     let step = kept.len().div_ceil(LISTED_FRAMES).max(1);
     let frames: Vec<u64> = kept.into_iter().rev().step_by(step).collect();
     let numbers = frames.iter().rev().map(u64::to_string).collect::<Vec<_>>().join(",");
-    let mut json = format!(r#"{{"frames":[{numbers}],"records":["#);
-    for (number, record) in records.into_iter().enumerate() {
-        if json.len() + record.len() > MAX_LIST_BYTES {
-            break;
-        }
-        if number > 0 {
-            json.push(',');
-        }
-        json += &record;
+    Ok(format!(r#"{{"frames":[{numbers}],"records":[{}]}}"#, records.join(",")).into_bytes())
+}
+
+/// Every second record, or fewer, down to this length in bytes. The newest stays.
+fn thinned(mut records: Vec<String>, most: usize) -> Vec<String> {
+    while records.len() > 1 && records.iter().map(|record| record.len() + 1).sum::<usize>() > most {
+        records = records.into_iter().rev().step_by(2).collect();
+        records.reverse();
     }
-    Ok((json + "]}").into_bytes())
+    records
 }
 
 /// JSON before a picture, as before those of a publisher.
@@ -152,4 +151,17 @@ fn picture(folder: &Path, frame: u64, tone_map: [f64; 3]) -> Result<Bytes, Refus
     let head = Head { frame, encoding: "png", shape: [height, width, 3], record: &record };
     let json = serde_json::to_string(&head).map_err(|error| unreadable(&error))?;
     Ok(message(&json, &png))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_that_is_too_long_keeps_the_newest_record_and_even_steps() {
+        let records: Vec<String> = (10..31).map(|number| number.to_string()).collect();
+        assert_eq!(thinned(records.clone(), 63), records);
+        assert_eq!(thinned(records.clone(), 62), ["10", "12", "14", "16", "18", "20", "22", "24", "26", "28", "30"]);
+        assert_eq!(thinned(records, 1), ["30"]);
+    }
 }
