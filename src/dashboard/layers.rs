@@ -2,6 +2,7 @@
 //! that no picture waits behind them, and the run makes none for pages that only look.
 
 use super::hub::Hub;
+use super::pixels::{CUT_OFF, NOT_COME, NOT_REACHED};
 use super::received::decode_layers;
 use crate::publish::LAYERS_TOPIC;
 use bytes::Bytes;
@@ -18,6 +19,10 @@ const LAYERS_WAIT: Duration = Duration::from_secs(4);
 const MAX_LAYERS_BYTES: usize = 192 << 20;
 /// Shortest time between two attempts to subscribe.
 const RECONNECT: Duration = Duration::from_millis(500);
+/// The same after a connection that seems too slow for them, which would otherwise be busy with them for ever.
+const RECONNECT_SLOW: Duration = Duration::from_secs(30);
+/// A connection that ends after this time without any seems too slow.
+const SLOW: Duration = Duration::from_secs(2);
 
 /// What became of the wish for layers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,7 +31,9 @@ enum Wish {
     Open,
     Met,
     /// The publisher is not reached.
-    Lost,
+    Unreached,
+    /// The connection ended before any came, and not at once.
+    CutOff,
 }
 
 /// Who needs layers, and whether there are any.
@@ -57,9 +64,13 @@ impl Layers {
         let _ = timeout(LAYERS_WAIT, self.wish.subscribe().wait_for(|wish| *wish != Wish::Open)).await;
     }
 
-    /// Whether the publisher was not reached.
-    pub fn are_lost(&self) -> bool {
-        *self.wish.borrow() == Wish::Lost
+    /// Why there are none, in words.
+    pub fn why_none(&self) -> &'static str {
+        match *self.wish.borrow() {
+            Wish::Open | Wish::Met => NOT_COME,
+            Wish::Unreached => NOT_REACHED,
+            Wish::CutOff => CUT_OFF,
+        }
     }
 
     /// Waits until no page has needed them for a while.
@@ -87,18 +98,22 @@ impl Hub {
             // Its sender is in the hub.
             let _ = needed.wait_for(|needed| is_recent(*needed)).await;
             let begin = Instant::now();
-            let ended = match Subscriber::connect(self.endpoint(), &[LAYERS_TOPIC], MAX_LAYERS_BYTES).await {
-                Ok(subscriber) => self.take_while_needed(subscriber).await,
-                Err(error) => Err(error),
-            };
-            layers.wish.send_replace(match ended {
-                Ok(()) => Wish::Open,
+            let (wish, pause) = match Subscriber::connect(self.endpoint(), &[LAYERS_TOPIC], MAX_LAYERS_BYTES).await {
+                Ok(subscriber) => match self.take_while_needed(subscriber).await {
+                    Ok(()) => (Wish::Open, RECONNECT),
+                    Err(error) => {
+                        tracing::debug!("layers: {error}");
+                        let is_slow = *layers.wish.borrow() != Wish::Met && begin.elapsed() > SLOW;
+                        if is_slow { (Wish::CutOff, RECONNECT_SLOW) } else { (Wish::Unreached, RECONNECT) }
+                    }
+                },
                 Err(error) => {
                     tracing::debug!("layers: {error}");
-                    Wish::Lost
+                    (Wish::Unreached, RECONNECT)
                 }
-            });
-            sleep_until(begin + RECONNECT).await;
+            };
+            layers.wish.send_replace(wish);
+            sleep_until(begin + pause).await;
         }
     }
 

@@ -27,8 +27,10 @@ const MAX_PICTURES: usize = 64;
 /// Of a picture that is published without its layers. A test holds the number to the publisher's.
 const TOO_LARGE: &str = "the run publishes layers of pictures of up to 4194304 pixels; with --dashboard it serves those of larger ones";
 /// Of layers that were asked for.
-const NOT_REACHED: &str = "the run is not reached";
-const NOT_COME: &str = "the layers of its newest frame have not come: try again (a run of an earlier version sends none)";
+pub(super) const NOT_REACHED: &str = "the run is not reached";
+pub(super) const CUT_OFF: &str =
+    "the connection to the run ended before its layers had come: it may be too slow for them (publish.stall_seconds of the run)";
+pub(super) const NOT_COME: &str = "the layers of its newest frame have not come: try again (a run of an earlier version sends none)";
 /// Of what is not sent.
 pub(super) const NO_WINDOW: &str = "only a run with --dashboard has it, since it is traced in the run's window";
 pub(super) const NO_CELLS: &str = "the run did not send its trusted cells: with --dashboard it has them";
@@ -187,9 +189,7 @@ impl Pixels {
         match self.newest.get(wanted) {
             Ok(frame) => Ok((frame, self.newest.about())),
             Err(NoFrame::NotYet) if self.is_too_large() => Err((StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE.to_owned())),
-            Err(NoFrame::NotYet) if self.is_beside => {
-                Err((StatusCode::NOT_FOUND, (if self.layers.are_lost() { NOT_REACHED } else { NOT_COME }).to_owned()))
-            }
+            Err(NoFrame::NotYet) if self.is_beside => Err((StatusCode::NOT_FOUND, self.layers.why_none().to_owned())),
             Err(NoFrame::NotYet) => Err((StatusCode::NOT_FOUND, "no frame is complete yet".to_owned())),
             Err(NoFrame::MovedOn { wanted, kept }) if self.is_beside => {
                 Err((StatusCode::GONE, format!("frame {wanted} is not kept here: the newest whose layers came is {kept}")))

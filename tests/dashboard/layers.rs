@@ -87,6 +87,25 @@ fn values_are_those_of_the_run_and_layers_are_subscribed_to_only_while_they_are_
     assert!(status == 404 && answer.contains("the run is not reached"), "{status} {answer}");
 }
 
+#[test]
+fn a_connection_that_ends_before_the_layers_have_come_is_named_and_not_tried_at_once() {
+    let stage = Stage::new();
+    let publisher = publisher(&stage, MapAbout::default());
+    std::thread::scope(|scope| {
+        // As of a client that takes longer than it may.
+        scope.spawn(|| {
+            std::thread::sleep(Duration::from_secs(3));
+            publisher.finish(LIMIT);
+        });
+        for waited in [4, 1] {
+            let begin = Instant::now();
+            let (status, answer) = get(stage.address(), &format!("/values?token={}&x=0&y=0", stage.token), &[]);
+            assert!(status == 404 && answer.contains("ended before its layers had come"), "{status} {answer}");
+            assert!(begin.elapsed() < Duration::from_secs(waited), "{:?}", begin.elapsed());
+        }
+    });
+}
+
 /// Also when a test fails.
 struct Ends<'a>(&'a AtomicBool);
 
