@@ -3,7 +3,7 @@
 use super::Chart;
 use super::ftle::{CHARGED, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel};
-use super::scaling::ScalingPanel;
+use super::scaling::{Axis, ScalingPanel};
 use super::verdict::size;
 use image::{ImageFormat, RgbImage};
 use plotters::coord::Shift;
@@ -143,10 +143,10 @@ fn panels(chart: &Chart) -> Vec<Panel> {
     if let Some(panel) = &chart.scaling {
         let tau = if chart.time_unit.is_empty() { "tau".to_owned() } else { format!("tau, {}", chart.time_unit) };
         let axes = [
-            ("tau", "tau", tau.as_str()),
-            ("snapshots", "snapshots in tau", "snapshots"),
-            ("nodes", "nodes of the grid", "nodes"),
-            ("threads", "threads", "threads"),
+            (Axis::Tau, "tau", tau.as_str()),
+            (Axis::Snapshots, "snapshots in tau", "snapshots"),
+            (Axis::Nodes, "nodes of the grid", "nodes"),
+            (Axis::Threads, "threads", "threads"),
         ];
         panels.extend(axes.into_iter().filter_map(|(axis, against, label)| scaling_panel(panel, axis, against, label)));
     }
@@ -214,7 +214,7 @@ fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
 }
 
 /// Costs along one axis; `None` with fewer than two points on it.
-fn scaling_panel(panel: &ScalingPanel, axis: &str, against: &str, label: &str) -> Option<Panel> {
+fn scaling_panel(panel: &ScalingPanel, axis: Axis, against: &str, label: &str) -> Option<Panel> {
     let mut along: Vec<_> = panel.points.iter().filter(|point| point.axis == axis).collect();
     if along.len() < 2 {
         return None;
@@ -248,7 +248,8 @@ fn picture_size(panels: &[Panel]) -> (u32, u32) {
 }
 
 fn title(chart: &Chart) -> String {
-    format!("{} (tau {}{}) on {}, {} CPU threads", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads)
+    let threads = if chart.threads == 1 { "thread" } else { "threads" };
+    format!("{} (tau {}{}) on {}, {} CPU {threads}", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads)
 }
 
 fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[Panel]) -> Result<(), DrawError> {
@@ -292,10 +293,38 @@ fn log(range: Range<f64>) -> Range<f64> {
     if last > first { low..high } else { 10f64.powf(low.log10().floor())..10f64.powf(high.log10().ceil()) }
 }
 
-/// Width and height that a label takes, in pixels.
-const LABEL: [i32; 2] = [160, 16];
-/// Pixels from a point to the corner of its label.
-const OFFSET: [i32; 2] = [8, -16];
+/// Size of the letters of labels, and the width of one, in pixels.
+const LABEL_SIZE: i32 = 13;
+const LETTER: f64 = 6.6;
+/// Half the width of a marker with some room around it, in pixels.
+const MARKER: i32 = 7;
+
+/// A rectangle in pixels: left, top, right, bottom.
+type Box = [i32; 4];
+
+/// Size of a label in pixels, from above.
+fn label_size(text: &str) -> [i32; 2] {
+    [(LETTER * text.chars().count() as f64).ceil() as i32, LABEL_SIZE + 2]
+}
+
+/// Corner of a label beside a point, so that it lies within `area` and on nothing in `taken`; `None` if there is no room.
+fn beside((x, y): (i32, i32), text: &str, area: Box, taken: &[Box]) -> Option<(i32, i32)> {
+    let [width, height] = label_size(text);
+    let corners = [
+        (x + MARKER, y - height - 2),
+        (x - MARKER - width, y - height - 2),
+        (x + MARKER, y + 4),
+        (x - MARKER - width, y + 4),
+        (x - width / 2, y - height - MARKER - 2),
+        (x - width / 2, y + MARKER + 2),
+    ];
+    corners.into_iter().find(|&(left, top)| {
+        let own = [left, top, left + width, top + height];
+        let is_within = own[0] >= area[0] && own[1] >= area[1] && own[2] <= area[2] && own[3] <= area[3];
+        let is_apart = |other: &Box| own[2] <= other[0] || other[2] <= own[0] || own[3] <= other[1] || other[3] <= own[1];
+        is_within && taken.iter().all(is_apart)
+    })
+}
 
 fn draw_panel<B, X, Y>(area: &DrawingArea<B, Shift>, panel: &Panel, x: X, y: Y) -> Result<(), DrawError>
 where
@@ -319,16 +348,33 @@ where
         .y_desc(&panel.y)
         .label_style((FONT, 15))
         .axis_desc_style((FONT, 17))
-        .x_label_formatter(&power)
-        .y_label_formatter(&|y| if panel.is_y_log { power(y) } else { format!("{y:.decimals$}") })
+        .x_label_formatter(&tick)
+        .y_label_formatter(&|y| if panel.is_y_log { tick(y) } else { format!("{y:.decimals$}") })
         .light_line_style(WHITE)
         .draw()
         .map_err(plot_error)?;
-    let ([x0, x1], _) = ([plot.x_range().start, plot.x_range().end], ());
+    let [x0, x1] = [plot.x_range().start, plot.x_range().end];
+    let [y0, y1] = [plot.y_range().start, plot.y_range().end];
+    let ((left, bottom), (right, top)) = (plot.backend_coord(&(x0, y0)), plot.backend_coord(&(x1, y1)));
+    let area = [left, top, right, bottom];
+    let is_drawn = |(x, y): &(f64, f64)| x.is_finite() && y.is_finite();
+    let markers = panel.series.iter().filter(|series| !series.is_line || series.points.len() <= MARKED).flat_map(|series| &series.points);
+    let mut taken: Vec<Box> = markers
+        .filter(|at| is_drawn(at))
+        .map(|at| {
+            let (x, y) = plot.backend_coord(at);
+            [x - MARKER, y - MARKER, x + MARKER, y + MARKER]
+        })
+        .collect();
     for (level, name) in &panel.levels {
         let style = BLACK.mix(0.5).stroke_width(1);
         plot.draw_series(DashedLineSeries::new([(x0, *level), (x1, *level)], 6, 4, style)).map_err(plot_error)?;
-        plot.draw_series([Text::new(name.clone(), (x0 * 1.05, *level), (FONT, 14).into_font())]).map_err(plot_error)?;
+        // Above its line.
+        let [width, height] = label_size(name);
+        let above = EmptyElement::at((x0, *level)) + Text::new(name.clone(), (5, -height), (FONT, LABEL_SIZE).into_font());
+        plot.draw_series([above]).map_err(plot_error)?;
+        let (x, y) = plot.backend_coord(&(x0, *level));
+        taken.push([x, y - height, x + 5 + width, y]);
     }
     for (number, series) in panel.series.iter().enumerate() {
         let colour = COLOURS[number % COLOURS.len()];
@@ -346,21 +392,15 @@ where
         }
     }
     plot.draw_series(LineSeries::new(panel.front.iter().map(|(x, y, _)| (*x, *y)), BLACK.stroke_width(1))).map_err(plot_error)?;
-    // Places whose labels would lie on those of the levels.
-    let beside = |(level, _): &(f64, String)| {
-        let (across, down) = plot.backend_coord(&(x0 * 1.05, *level));
-        (across - OFFSET[0], down - OFFSET[1])
-    };
-    let mut drawn: Vec<(i32, i32)> = panel.levels.iter().map(beside).collect();
-    for (x, y, label) in &panel.front {
-        // A label that would lie on another one is left out; the table has them all.
-        let (across, down) = plot.backend_coord(&(*x, *y));
-        if drawn.iter().any(|&(x, y)| (across - x).abs() < LABEL[0] && (down - y).abs() < LABEL[1]) {
-            continue;
-        }
-        drawn.push((across, down));
-        let at = EmptyElement::at((*x, *y)) + Text::new(label.clone(), (OFFSET[0], OFFSET[1]), (FONT, 13).into_font());
-        plot.draw_series([at]).map_err(plot_error)?;
+    // That of the pick first. One without room is left out; the table has them all.
+    let is_pick = |(x, y, _): &&(f64, f64, String)| panel.pick == Some((*x, *y));
+    for (x, y, label) in panel.front.iter().filter(is_pick).chain(panel.front.iter().filter(|place| !is_pick(place))) {
+        let point = plot.backend_coord(&(*x, *y));
+        let Some((across, down)) = beside(point, label, area, &taken) else { continue };
+        let [width, height] = label_size(label);
+        taken.push([across, down, across + width, down + height]);
+        let text = Text::new(label.clone(), (across - point.0, down - point.1), (FONT, LABEL_SIZE).into_font());
+        plot.draw_series([EmptyElement::at((*x, *y)) + text]).map_err(plot_error)?;
     }
     if let Some(pick) = panel.pick {
         plot.draw_series([Circle::new(pick, 11, BLACK.stroke_width(2))]).map_err(plot_error)?;
@@ -368,7 +408,13 @@ where
     Ok(())
 }
 
-/// A label of a logarithmic axis: 0.001 to 1000 in full, powers beyond.
+/// A label of a tick on a logarithmic axis. Those of all tenths within a decade would run into each other: of 1, 2 and 5 only.
+fn tick(value: &f64) -> String {
+    let digit = (value / 10f64.powf((value.log10() + 1e-9).floor())).round() as i64;
+    if [1, 2, 5].contains(&digit) { power(value) } else { String::new() }
+}
+
+/// A number on a logarithmic axis: 0.001 to 1000 in full, powers beyond.
 fn power(value: &f64) -> String {
     // Two digits, since ticks carry rounding.
     let rounded = format!("{value:.1e}").parse().unwrap_or(*value);
@@ -404,7 +450,7 @@ fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -
 
 #[cfg(test)]
 mod tests {
-    use super::log;
+    use super::{beside, log, tick};
 
     #[test]
     fn a_logarithmic_axis_has_two_labels_at_least() {
@@ -412,5 +458,21 @@ mod tests {
         assert_eq!(log(0.8..2.0), 0.1..10.0);
         let wide = log(0.05..20.0);
         assert!(wide.start > 0.03 && wide.end < 40.0, "{wide:?}");
+    }
+
+    #[test]
+    fn ticks_that_would_touch_have_no_label() {
+        let labels = [0.1, 0.2, 0.300_000_000_1, 0.5, 0.7, 0.9, 1.0, 2e-7].map(|value| tick(&value));
+        assert_eq!(labels, ["0.1", "0.2", "", "0.5", "", "", "1", "2e-7"]);
+    }
+
+    #[test]
+    fn labels_lie_within_the_panel_and_beside_what_is_drawn() {
+        let area = [0, 0, 200, 100];
+        assert_eq!(beside((50, 50), "label", area, &[]), Some((57, 33)), "above, to the right");
+        assert_eq!(beside((190, 50), "label", area, &[]), Some((150, 33)), "to the left at the right edge");
+        let marker = [60, 30, 74, 44];
+        assert_eq!(beside((50, 50), "label", area, &[marker]), Some((10, 33)));
+        assert_eq!(beside((50, 50), "label", area, &[area]), None);
     }
 }

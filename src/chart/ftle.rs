@@ -12,9 +12,9 @@ use crate::flow::{
 use crate::render::Method;
 use crate::render::rng::{philox, unit};
 use crate::run::{Plan, RunError, Settings, Setup, Slide, auto_steps};
-use crate::surrogate::network::{Encoding, NetworkSettings};
+use crate::surrogate::network::{Architecture, Encoding, NetworkSettings};
 use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -42,22 +42,24 @@ const REUSE: u64 = 4;
 /// Labels before the first training, and most fresh ones afterwards.
 const FIRST_LABELS: usize = 1 << 16;
 const MAX_FRESH: usize = 1 << 24;
-/// A small network has 2^-5 of the entries.
+/// A small network has at most 2^-4 of the entries, and a table of 2^-5 or less.
 const SMALLER: u32 = 5;
 /// What is said of methods that ran on the CPU in a chart of a GPU.
 #[cfg(feature = "cuda")]
 const ON_THE_CPU: &str = ", on the CPU";
 
 /// A method with a setting.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FtlePoint {
     /// Family, as in the legend.
     pub method: String,
     /// Setting within the family.
     pub setting: String,
     /// Root mean square error of the FTLE, 1/time.
+    #[serde(deserialize_with = "super::number_or_nan")]
     pub rms: f64,
     /// 99th percentile of the absolute error, 1/time.
+    #[serde(deserialize_with = "super::number_or_nan")]
     pub p99: f64,
     /// PSNR in decibels with the largest true FTLE as peak; `None` if the error or the peak is 0.
     pub psnr: Option<f64>,
@@ -84,7 +86,7 @@ impl FtlePoint {
 }
 
 /// Errors and costs of FTLE samples.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct FtlePanel {
     /// Points on which errors are measured.
     pub points: usize,
@@ -103,7 +105,7 @@ pub struct FtlePanel {
 }
 
 /// The methods that no other beats in error and seconds at once.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Front {
     /// Number of samples.
     pub samples: f64,
@@ -512,7 +514,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize, place: &str) -> Result<(), 
         let per_interval = steps.div_ceil(intervals);
         let built = bench.charting.pool.install(|| Composition::trace(velocity, map, time, nodes, intervals, per_interval));
         let Some(plain) = built.map_err(RunError::Flow)? else {
-            bench.charting.skip("composed flow maps", "only on Cartesian grids, and only if particles never stop or wrap");
+            bench.charting.skip("composition", "only on Cartesian grids, and only if particles never stop or wrap");
             return Ok(());
         };
         let plain_seconds = began.elapsed().as_secs_f64();
@@ -571,20 +573,29 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
     let own = bench.opened.own_nodes(is_gpu);
     let scene = NetworkSettings { inputs: Vec::new(), start_range: None, ..bench.opened.plan.scene.network.clone() };
     let suited = bench.opened.shape().filter(|_| is_gpu).map_or(scene.clone(), |shape| scene.suited_to(shape));
-    let small = NetworkSettings { log2_table: Some(suited.log2_table().saturating_sub(SMALLER).max(4)), ..scene.clone() };
+    let domain = &bench.opened.plan.domain;
+    let axes: Vec<usize> = (0..domain.dimensions).collect();
+    let entries =
+        |network: &NetworkSettings| Architecture::new(network, &axes, domain.lengths()).map_or(0, |network| network.table_entries());
+    // Levels that are stored densely do not shrink with the table at once.
+    let sizes = (4..=suited.log2_table().saturating_sub(SMALLER).max(4)).rev();
+    let mut smaller = sizes.map(|log2_table| NetworkSettings { log2_table: Some(log2_table), ..suited.clone() });
+    let small = smaller.find(|network| entries(network) << (SMALLER - 1) <= entries(&suited));
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene };
     let narrow = NetworkSettings { hidden_layers: 4, width: 64, ..frequency.clone() };
     let mut variants = vec![
         ("base + residual", Kind::Residual, scaled(own, 0.5), suited.clone()),
-        ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()),
         ("network", Kind::Network, own, suited),
-        ("network", Kind::Network, own, small),
         ("network", Kind::Network, own, if is_gpu { frequency } else { narrow }),
     ];
+    if let Some(small) = small {
+        variants.insert(1, ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()));
+        variants.insert(3, ("network", Kind::Network, own, small));
+    }
     variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
     for (name, kind, nodes, network) in variants {
         let size = match network.encoding {
-            Encoding::HashGrid => format!("{}x{}, 2^{} entries", network.levels(), network.features, network.log2_table()),
+            Encoding::HashGrid => format!("{}x{}, {} entries", network.levels(), network.features, thousands(entries(&network))),
             Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
         };
         let what = format!("{name}, {size}");
@@ -617,6 +628,15 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
         }
     }
     Ok(())
+}
+
+/// A count in thousands or millions.
+fn thousands(count: usize) -> String {
+    match count {
+        0..10_000 => count.to_string(),
+        10_000..1_000_000 => format!("{:.0}k", count as f64 / 1e3),
+        _ => format!("{:.1}M", count as f64 / 1e6),
+    }
 }
 
 /// Training on labels at uniform random points that are traced on the way, as the frames of a run trace theirs.

@@ -20,7 +20,7 @@ pub use draw::{Curve, DrawError, write_epochs, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{Front, FtlePanel, FtlePoint};
 pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, Sliding, TARGETS, Truth, most_wrong, picture_errors};
-pub use scaling::{ScalingPanel, ScalingPoint};
+pub use scaling::{Axis, ScalingPanel, ScalingPoint};
 pub use still::fixed_colours;
 pub use table::csv;
 pub use train::{Epoch, TrainOptions, TrainReport, train};
@@ -30,9 +30,9 @@ pub use verdict::verdict;
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend as _, BackendError, Cpu, Device};
 use crate::render::Method;
-use crate::run::{RunError, Settings};
+use crate::run::{RunError, Settings, auto_is_map};
 use crate::surrogate::Kind;
-use serde::Serialize;
+use serde::{Deserialize, Deserializer, Serialize};
 use slides::FirstSlides;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -57,7 +57,7 @@ impl Default for ChartOptions {
 }
 
 /// The chart of a scene.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Chart {
     /// Title of the scene.
     pub scene: String,
@@ -149,6 +149,11 @@ pub fn device_name(device: &Device) -> String {
     }
 }
 
+/// A number that JSON writes as `null`, since it is none or infinite.
+fn number_or_nan<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
 /// Error of a backend or its device.
 fn failed(error: impl Into<BackendError>) -> RunError {
     RunError::of(error.into())
@@ -172,10 +177,12 @@ pub fn chart(
     let threads = pool.current_num_threads();
     let ends = began + Duration::from_secs_f64(options.seconds);
     let slides = FirstSlides::read(settings, if options.pictures { picture::SLIDES } else { 1 }, stop)?;
+    let given = settings;
     let settings = &slides.settled(settings);
     let mut charting = Charting { settings, device, pool, ends, stop, tell, not_measured: Vec::new() };
     let opened = ftle::Opened::new(settings, device, &slides)?;
     let (source, tau, time_unit) = (opened.plan.source.clone(), opened.plan.map.tau, opened.plan.time_unit.clone());
+    let auto_is_map = auto_is_map(given, &opened.plan.domain);
     let ftle = if options.ftle {
         let share = if options.pictures { 0.45 } else { 0.85 };
         Some(charting.with_share(share, |charting| ftle::panel(charting, &opened))?)
@@ -183,7 +190,7 @@ pub fn chart(
         None
     };
     let scaling = if options.scaling { Some(charting.with_share(0.15, |charting| scaling::panel(charting, &opened))?) } else { None };
-    let pictures = if options.pictures { Some(picture::panel(&mut charting, &slides)?) } else { None };
+    let pictures = if options.pictures { Some(picture::panel(&mut charting, &slides, auto_is_map)?) } else { None };
     Ok(Chart {
         scene: settings.title.clone(),
         source,

@@ -9,7 +9,7 @@ use crate::render::{Film, Method};
 use crate::run::{Event, Frame, Race, RunError, RunOptions, Settings, run};
 use crate::surrogate::Kind;
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -29,7 +29,7 @@ const TRUTH_SAMPLES: f64 = 16.0;
 pub(super) const SLIDES: usize = 3;
 
 /// A frame of a curve.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct PicturePoint {
     /// Seconds since the slide: its preparation and all frames so far, training included.
     pub seconds: f64,
@@ -41,14 +41,14 @@ pub struct PicturePoint {
     pub psnr_all: f64,
     /// Mean of squared error / (radiance^2 + 0.01) over lit pixels, linear.
     pub relmse: f64,
-    /// Structural similarity of the tone-mapped luma with the mean of the truth's halves; of the last frame only.
+    /// Structural similarity of the tone-mapped luma with the mean of the truth's halves; of the frames that reach [`TARGETS`] and of the last one.
     pub ssim: Option<f64>,
     /// PSNR over lit pixels that the frame states; `None` if the method states none.
     pub stated_psnr: Option<f64>,
 }
 
 /// The frames of a method.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PictureCurve {
     /// Method.
     pub method: String,
@@ -63,7 +63,7 @@ pub struct PictureCurve {
 }
 
 /// A window that slides at every frame.
-#[derive(Debug, Clone, Copy, Serialize)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Sliding {
     /// Frames per second, preparation included.
     pub frames_per_second: f64,
@@ -86,7 +86,7 @@ impl PictureCurve {
     }
 
     /// The frame from which on the PSNR over lit pixels is at least `decibels`; `None` if the last one is below.
-    fn reaches(&self, decibels: f64) -> Option<&PicturePoint> {
+    pub(super) fn reaches(&self, decibels: f64) -> Option<&PicturePoint> {
         let below = self.frames.iter().rposition(|frame| frame.psnr < decibels);
         self.frames.get(below.map_or(0, |last| last + 1))
     }
@@ -112,13 +112,14 @@ impl PicturePanel {
 }
 
 /// Curves of all methods.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PicturePanel {
     /// Width and height in pixels.
     pub size: [usize; 2],
     /// Samples a pixel of both halves of the first window's truth.
     pub truth_samples: f64,
     /// PSNR over lit pixels of the mean of the halves, whose noise is taken off from errors.
+    #[serde(deserialize_with = "super::number_or_nan")]
     pub truth_psnr: f64,
     /// One curve per method and surrogate.
     pub curves: Vec<PictureCurve>,
@@ -126,6 +127,9 @@ pub struct PicturePanel {
     pub kind: Kind,
     /// The same race as that of `render.method = "auto"`, by the true errors of these curves; `None` if no method reached its target.
     pub race: Option<Race>,
+    /// True if `render.method = "auto"` draws the scene as a map, which is none of these curves.
+    #[serde(default)]
+    pub auto_is_map: bool,
 }
 
 /// Two independent pictures of the same scene. Half of their difference is the noise of their mean, which is taken off from squared errors against it.
@@ -238,7 +242,7 @@ pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> Picture
 }
 
 /// Renders the truth and the curves.
-pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result<PicturePanel, RunError> {
+pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_map: bool) -> Result<PicturePanel, RunError> {
     let mut settings = charting.settings.clone();
     settings.transfer = Some(colours_of(&settings, charting.device, slides)?);
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
@@ -277,6 +281,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
             curves: Vec::new(),
             kind: settings.surrogate.kind,
             race: None,
+            auto_is_map,
         });
     }
     let last_truth = if slides.count() < SLIDES {
@@ -331,7 +336,8 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         }
         curves.push(curve);
     }
-    let mut panel = PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind: settings.surrogate.kind, race: None };
+    let mut panel =
+        PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind: settings.surrogate.kind, race: None, auto_is_map };
     panel.race = Race::of_times(|method, target| {
         let curve = panel.curve(method)?;
         match method {
@@ -354,7 +360,8 @@ fn measure(
     frames: &mut Vec<PicturePoint>,
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
-    let (mut seconds, mut last) = (0.0, None);
+    let (mut seconds, mut last, mut highest) = (0.0, None, f64::NEG_INFINITY);
+    let ssim = |film: &Film, tone_map| compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
     let bytes = still(scene.clone(), options, (slides, 0), |frame| {
         let record = &frame.record;
         seconds += record.seconds.slide + record.seconds.total;
@@ -362,6 +369,8 @@ fn measure(
         let accumulated = scene.render.method.is_smooth() || sum.accumulate(&frame.film).is_err();
         let film = if accumulated { &*frame.film } else { &sum };
         let errors = picture_errors(film, truth, frame.tone_map);
+        let is_first = TARGETS.iter().any(|target| (highest..=errors.psnr).contains(target));
+        highest = highest.max(errors.psnr);
         let own = record.samples_per_pixel * (record.frame + 1) as f64;
         frames.push(PicturePoint {
             seconds,
@@ -369,7 +378,7 @@ fn measure(
             psnr: errors.psnr,
             psnr_all: errors.psnr_all,
             relmse: errors.relmse,
-            ssim: None,
+            ssim: is_first.then(|| ssim(film, frame.tone_map)).flatten(),
             stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
         });
         last = Some((frame.film.clone(), frame.tone_map));
@@ -377,7 +386,7 @@ fn measure(
     })?;
     if let (Some((film, tone_map)), Some(point)) = (last, frames.last_mut()) {
         let film = if scene.render.method.is_smooth() { &*film } else { &sum };
-        point.ssim = compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
+        point.ssim = ssim(film, tone_map);
     }
     Ok(bytes)
 }

@@ -12,23 +12,49 @@ use crate::run::RunError;
 use crate::source::SourceKind;
 use crate::surrogate::network::NetworkSettings;
 use crate::surrogate::{Kind, Predict, SurrogateSettings, Trace};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// Points of a timed batch.
 const BATCH: [usize; 2] = [1 << 16, 1 << 21];
-/// Points on which windows are compared.
+/// Points on which windows, and tables and tracing, are compared.
 const COMPARED: usize = 1 << 13;
 /// Most bytes of a window of turbulence on finer grids, which is made for the chart alone.
 const MOST_MADE: usize = 1 << 28;
 
+/// What makes a task larger.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Axis {
+    /// Duration of the integration.
+    Tau,
+    /// Snapshots in it.
+    Snapshots,
+    /// Nodes of the grid.
+    Nodes,
+    /// Threads of the CPU.
+    Threads,
+}
+
+impl Axis {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tau => "tau",
+            Self::Snapshots => "snapshots",
+            Self::Nodes => "nodes",
+            Self::Threads => "threads",
+        }
+    }
+}
+
 /// Costs at one size of the task.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ScalingPoint {
-    /// `tau`, `snapshots`, `nodes` or `threads`.
-    pub axis: &'static str,
+    /// What varies.
+    pub axis: Axis,
     /// Value on the axis; of `nodes` the number of all nodes.
     pub value: f64,
     /// Steps that meet the tolerance.
@@ -39,6 +65,9 @@ pub struct ScalingPoint {
     pub table_ns: f64,
     /// Seconds to trace the table.
     pub table_seconds: f64,
+    /// Root mean square error of the FTLE from it, against that of the same tracing, 1/time; `None` in charts of before.
+    #[serde(default)]
+    pub table_rms: Option<f64>,
     /// Samples from which on the table is cheaper, its tracing included; `None` if it never is.
     pub table_pays_from: Option<f64>,
     /// Of `snapshots`, and of `nodes` of one flow: root mean square difference of the FTLE from that of all of them, 1/time. `None` for all of them.
@@ -46,7 +75,7 @@ pub struct ScalingPoint {
 }
 
 /// Costs against the size of the task.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct ScalingPanel {
     /// All sizes.
     pub points: Vec<ScalingPoint>,
@@ -61,7 +90,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
     let mut whole = None;
     for factor in longest {
         let map = FlowMap { tau: tau * factor, ..opened.plan.map.clone() };
-        let measured = point(charting, opened, &map, "tau", tau * factor)?;
+        let measured = point(charting, opened, &map, Axis::Tau, tau * factor)?;
         if *factor == 1.0 {
             whole.clone_from(&measured);
         }
@@ -76,16 +105,17 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
             let snapshots = thinned.snapshots().len() as f64;
             let other = opened.over(VelocitySource::Window(Arc::new(thinned)));
             let rms = Some(charting.pool.install(|| difference(opened, &other))?);
-            points.extend(point(charting, &other, &opened.plan.map, "snapshots", snapshots)?.map(|point| ScalingPoint { rms, ..point }));
+            points
+                .extend(point(charting, &other, &opened.plan.map, Axis::Snapshots, snapshots)?.map(|point| ScalingPoint { rms, ..point }));
         }
-        points.extend(at("snapshots", count as f64));
+        points.extend(at(Axis::Snapshots, count as f64));
         let nodes = opened.shape().unwrap_or([1; 3]);
         if charting.settings.source.kind == SourceKind::Turbulence {
             of_turbulence(charting, opened, nodes, count, &mut points)?;
         } else {
             of_coarser(charting, opened, window, &mut points)?;
         }
-        points.extend(at("nodes", nodes.iter().product::<usize>() as f64));
+        points.extend(at(Axis::Nodes, nodes.iter().product::<usize>() as f64));
     }
     if !charting.device.is_gpu() {
         let all = charting.pool.current_num_threads();
@@ -93,7 +123,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
         numbers.push(all);
         for threads in numbers {
             let own = std::mem::replace(&mut charting.pool, rayon::ThreadPoolBuilder::new().num_threads(threads).build()?);
-            let measured = point(charting, opened, &opened.plan.map, "threads", threads as f64);
+            let measured = point(charting, opened, &opened.plan.map, Axis::Threads, threads as f64);
             charting.pool = own;
             points.extend(measured?);
         }
@@ -118,7 +148,7 @@ fn of_turbulence(
         let mut settings = charting.settings.clone();
         settings.source.nodes = Some(other);
         let other = Opened::new(&settings, charting.device, &FirstSlides::read(&settings, 1, charting.stop)?)?;
-        points.extend(point(charting, &other, &opened.plan.map, "nodes", count as f64)?);
+        points.extend(point(charting, &other, &opened.plan.map, Axis::Nodes, count as f64)?);
     }
     Ok(())
 }
@@ -133,7 +163,7 @@ fn of_coarser(charting: &mut Charting<'_>, opened: &Opened, window: &Window, poi
         pair.iter_mut().for_each(|opened| opened.plan.domain = grid.domain());
         let [whole, other] = pair;
         let rms = Some(charting.pool.install(|| difference(&whole, &other))?);
-        let measured = point(charting, &other, &opened.plan.map, "nodes", grid.nodes() as f64)?;
+        let measured = point(charting, &other, &opened.plan.map, Axis::Nodes, grid.nodes() as f64)?;
         points.extend(measured.map(|point| ScalingPoint { rms, ..point }));
     }
     Ok(())
@@ -155,14 +185,8 @@ fn difference(whole: &Opened, thinned: &Opened) -> Result<f64, RunError> {
     Ok((squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt() / first.tau())
 }
 
-fn point(
-    charting: &mut Charting<'_>,
-    opened: &Opened,
-    map: &FlowMap,
-    axis: &'static str,
-    value: f64,
-) -> Result<Option<ScalingPoint>, RunError> {
-    let what = format!("cost at {axis} {value}");
+fn point(charting: &mut Charting<'_>, opened: &Opened, map: &FlowMap, axis: Axis, value: f64) -> Result<Option<ScalingPoint>, RunError> {
+    let what = format!("cost at {} {value}", axis.name());
     if !charting.has_time_for(&what) {
         return Ok(None);
     }
@@ -187,10 +211,11 @@ struct Costs {
     trace: f64,
     table: f64,
     table_seconds: f64,
+    table_rms: f64,
 }
 
 impl Costs {
-    fn at(&self, axis: &'static str, value: f64) -> ScalingPoint {
+    fn at(&self, axis: Axis, value: f64) -> ScalingPoint {
         let saved = self.trace - self.table;
         ScalingPoint {
             axis,
@@ -199,6 +224,7 @@ impl Costs {
             trace_ns: 1e9 * self.trace,
             table_ns: 1e9 * self.table,
             table_seconds: self.table_seconds,
+            table_rms: Some(self.table_rms),
             table_pays_from: (saved > 0.0).then(|| self.table_seconds / saved),
             rms: None,
         }
@@ -239,5 +265,11 @@ fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, is_gpu: bool,
     let frozen = surrogate.freeze()?;
     let mut values = vec![0.0; batch];
     let table = median(batch, || frozen.seconds(&unit, &mut values))?;
-    Ok(Some(Costs { steps: tracer.flow().steps(), trace, table, table_seconds }))
+    // Batches that were timed stay on a device.
+    tracer.trace(&seeds[..COMPARED], Extras::default(), &mut traced)?;
+    frozen.predict(&unit[..COMPARED], &mut values[..COMPARED])?;
+    let squares = traced.log_stretch.iter().zip(&values).map(|(a, b)| f64::from(a - b).powi(2)).filter(|square| square.is_finite());
+    let (sum, count) = squares.fold((0.0, 0_usize), |(sum, count), square| (sum + square, count + 1));
+    let table_rms = (sum / count.max(1) as f64).sqrt() / tracer.flow().tau();
+    Ok(Some(Costs { steps: tracer.flow().steps(), trace, table, table_seconds, table_rms }))
 }

@@ -47,9 +47,11 @@ pub fn csv(chart: &Chart) -> String {
         }
     }
     for point in chart.scaling.iter().flat_map(|panel| &panel.points) {
-        for (method, nanoseconds, build) in [("tracing", point.trace_ns, 0.0), ("table", point.table_ns, point.table_seconds)] {
-            let setting = format!("{} {}", point.axis, point.value);
-            let (speed, rms) = (1e9 / nanoseconds, number(point.rms));
+        for (method, nanoseconds, build, rms) in
+            [("tracing", point.trace_ns, 0.0, point.rms), ("table", point.table_ns, point.table_seconds, point.table_rms)]
+        {
+            let setting = format!("{} {}", point.axis.name(), point.value);
+            let (speed, rms) = (1e9 / nanoseconds, number(rms));
             let _ = writeln!(out, "scaling,{method},{},,{build:.6e},{speed:.6e},,{rms},,,,,,,,{}", text(&setting), point.steps);
         }
     }

@@ -2,7 +2,7 @@
 
 use super::Chart;
 use super::ftle::{CHARGED, Front, FtlePanel, FtlePoint};
-use super::picture::{PictureCurve, PicturePanel, RESOLVED, TARGETS};
+use super::picture::{PictureCurve, PicturePanel, PicturePoint, RESOLVED, TARGETS};
 use crate::render::Method;
 
 /// Multiples of the tolerance for which the cheapest method is named, in words.
@@ -12,7 +12,7 @@ const TOLERANCES: [(f64, &str); 3] = [(3.0, "three times the tolerance"), (1.0, 
 pub fn verdict(chart: &Chart) -> Vec<String> {
     let mut said = Vec::new();
     if let Some(panel) = &chart.ftle {
-        of_ftle(panel, &chart.time_unit, &mut said);
+        of_ftle(panel, chart, &mut said);
     }
     if let Some(panel) = &chart.pictures {
         of_pictures(panel, &mut said);
@@ -22,10 +22,16 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             Some(samples) => format!("the table pays from {samples:.1e} samples on"),
             None => "the table never pays".into(),
         };
-        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all {}.", point.axis));
+        let within = match (point.table_rms, chart.ftle.as_ref().map(|panel| panel.tolerance)) {
+            (Some(rms), Some(tolerance)) if rms > tolerance => format!(", with rms {rms:.1e}, not within the tolerance"),
+            (Some(rms), _) => format!(", with rms {rms:.1e}"),
+            (None, _) => ", whatever its error".to_owned(),
+        };
+        let from = from + &within;
+        let axis = point.axis.name();
+        let differs = point.rms.map_or(String::new(), |rms| format!(" The FTLE differs by {rms:.1e} rms from that of all {axis}."));
         said.push(format!(
-            "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
-            point.axis,
+            "{axis} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.{differs}",
             point.value,
             point.steps,
             point.trace_ns,
@@ -36,7 +42,8 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
     said
 }
 
-fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
+fn of_ftle(panel: &FtlePanel, chart: &Chart, said: &mut Vec<String>) {
+    let time_unit = &chart.time_unit;
     let per = if time_unit.is_empty() { String::new() } else { format!(" /{time_unit}") };
     let tolerance = panel.tolerance;
     let methods: Vec<&FtlePoint> = panel.methods.iter().filter(|point| point.is_sound(panel.points)).collect();
@@ -84,7 +91,8 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
             said.push(if best.is_finite() {
                 format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.")
             } else {
-                format!("{class}: not measured.")
+                let why = chart.not_measured.iter().find_map(|line| line.strip_prefix(class)?.strip_prefix(": "));
+                format!("{class}: not measured{}.", why.map_or(String::new(), |why| format!(", {why}")))
             });
             continue;
         }
@@ -139,15 +147,17 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
             said.push(format!("{target} dB over lit pixels: the truth tells up to {resolved:.1} dB; more --seconds give it more samples."));
             continue;
         }
-        let reached = |curve: &super::PictureCurve| curve.seconds_to(target).map(|seconds| (seconds, curve.name()));
-        let mut times: Vec<(f64, String)> = panel.curves.iter().filter_map(reached).collect();
-        times.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let reached = |curve: &PictureCurve| curve.reaches(target).map(|frame| (*frame, curve.name()));
+        let mut times: Vec<(PicturePoint, String)> = panel.curves.iter().filter_map(reached).collect();
+        times.sort_by(|a, b| a.0.seconds.total_cmp(&b.0.seconds));
         said.push(match times.as_slice() {
             [] => format!("{target} dB over lit pixels: reached by no method in the time given."),
-            [(seconds, first), rest @ ..] => {
-                let others: Vec<String> = rest.iter().map(|(seconds, name)| format!("{name} {}", duration(*seconds))).collect();
+            [(frame, first), rest @ ..] => {
+                let others: Vec<String> = rest.iter().map(|(frame, name)| format!("{name} {}", duration(frame.seconds))).collect();
                 let others = if others.is_empty() { "no other method reached it".into() } else { others.join(", ") };
-                format!("{target} dB over lit pixels: {first} after {} ({others}).", duration(*seconds))
+                let ssim = frame.ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.3}"));
+                let also = format!("relMSE {:.1e}{ssim}", frame.relmse);
+                format!("{target} dB over lit pixels: {first} after {}, {also} ({others}).", duration(frame.seconds))
             }
         });
     }
@@ -184,6 +194,10 @@ fn of_auto(panel: &PicturePanel) -> String {
         Some(_) => " It stays with it in its race.".to_owned(),
         None => String::new(),
     };
+    if panel.auto_is_map {
+        let why = "since its flow has two dimensions and it sets nothing of a volume. Of these curves, which are of volumes";
+        return format!("render.method = \"auto\" draws this scene as a map, {why}, {first}: {compared}.");
+    }
     format!("render.method = \"auto\" begins with {first}: {compared}.{goes_on}")
 }
 

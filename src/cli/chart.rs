@@ -1,4 +1,4 @@
-//! `ridgewatch chart`: speed against accuracy of a scene, and the pick.
+//! `ridgewatch chart`: speed against accuracy of a scene, and the pick; or a chart of before, drawn anew.
 
 use super::common::{CHART, Common, Interrupted, RaceFile, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
 use super::messages;
@@ -18,8 +18,8 @@ const STOP_WITHIN: Duration = Duration::from_secs(60);
 /// Options of `chart`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files, globs and URLs of Zarr stores.
-    #[arg(required = true, value_name = "CONFIG | FILES")]
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores; or a chart.json, which is drawn anew without measuring.
+    #[arg(required = true, value_name = "CONFIG | FILES | CHART.json")]
     paths: Vec<PathBuf>,
     /// Seconds for all measurements. What did not fit is named.
     #[arg(long, default_value_t = 300.0, value_parser = seconds, value_name = "S")]
@@ -49,6 +49,15 @@ struct Report<'a> {
 
 /// Charts.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
+    if let [path] = options.paths.as_slice()
+        && path.extension().is_some_and(|extension| extension == "json")
+    {
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let chart: Chart =
+            serde_json::from_str(&text).with_context(|| format!("{} is no chart.json of `ridgewatch chart`", path.display()))?;
+        std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
+        return write(common, options, &chart, &verdict(&chart)).map(drop);
+    }
     let scene = scene(common, &options.paths)?;
     if scene.source.kind == SourceKind::Live {
         bail!(Usage(
@@ -71,15 +80,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         .map_err(|error| located(&scene, error, RunError::refused))?;
     bar.finish_and_clear();
     let said = verdict(&chart);
-    let report = Report { chart: &chart, verdict: &said };
-    let files = [
-        ("chart.csv", csv(&chart).into_bytes()),
-        ("chart.svg", write_svg(&chart)?.into_bytes()),
-        ("chart.png", write_png(&chart)?),
-        ("chart.json", serde_json::to_vec_pretty(&report)?),
-    ];
+    let svg = write(common, options, &chart, &said)?;
     if let Some(path) = beside_scene(&options.paths, CHART).filter(|_| stop.status() == 0) {
-        match write_whole(&path, &files[1].1) {
+        match write_whole(&path, &svg) {
             Ok(()) => messages::note(format_args!("the dashboard of this scene shows {}", path.display())),
             Err(error) => messages::note(format_args!("the dashboard will not show this chart: {}: {error}", path.display())),
         }
@@ -88,6 +91,22 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     if let (Some(file), Some(race)) = (RaceFile::of(common, &scene, &options.paths, &device)?, race) {
         file.write(race)?;
     }
+    match stop.status() {
+        0 => Ok(()),
+        status => bail!(Interrupted { status, done: "the chart has what was measured until then" }),
+    }
+}
+
+/// Writes the files of a chart and prints what it says. Returns the SVG.
+fn write(common: &Common, options: &Options, chart: &Chart, said: &[String]) -> Result<Vec<u8>> {
+    let report = Report { chart, verdict: said };
+    let svg = write_svg(chart)?.into_bytes();
+    let files = [
+        ("chart.csv", csv(chart).into_bytes()),
+        ("chart.svg", svg.clone()),
+        ("chart.png", write_png(chart)?),
+        ("chart.json", serde_json::to_vec_pretty(&report)?),
+    ];
     for (name, bytes) in files {
         let path = options.out.join(name);
         write_whole(&path, &bytes).with_context(|| format!("cannot write {}", path.display()))?;
@@ -101,8 +120,5 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
         print_text(format_args!("{}: chart.png, chart.svg, chart.csv, chart.json, after {:.0} s", options.out.display(), chart.seconds));
     }
-    match stop.status() {
-        0 => Ok(()),
-        status => bail!(Interrupted { status, done: "the chart has what was measured until then" }),
-    }
+    Ok(svg)
 }

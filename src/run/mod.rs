@@ -45,7 +45,7 @@ pub use race::Race;
 pub use record::{CheckpointRecord, DomainRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;
 pub use settings::{MapSettings, Settings, TimeSettings, TimeSpan, TrainingSettings};
-pub(crate) use setup::auto_steps;
 pub use setup::{Plan, Setup};
+pub(crate) use setup::{auto_is_map, auto_steps};
 pub use slides::{Slide, Slides, open_snapshots};
 pub use steering::{Change, Command, Range, Steering, SteeringState};

@@ -277,6 +277,11 @@ fn settle_method(scene: &mut Settings, domain: &Domain, decisions: &mut Vec<Deci
     Ok(races)
 }
 
+/// True if `render.method = "auto"` and the default draw a scene over a domain as a map.
+pub(crate) fn auto_is_map(scene: &Settings, domain: &Domain) -> bool {
+    domain.dimensions == 2 && of_volumes(scene).is_empty()
+}
+
 /// The keys of the scene that only a picture of a volume has.
 fn of_volumes(scene: &Settings) -> Vec<&'static str> {
     let transfer = scene.transfer.clone().unwrap_or_default();

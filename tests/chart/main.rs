@@ -118,6 +118,34 @@ fn pictures_converge_and_the_chart_is_drawn() {
     for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "Double gyre"] {
         assert!(svg.contains(words), "{words}");
     }
+    // The frames that are named for a target tell all measures of error.
+    let reached = curves.iter().flat_map(|curve| curve["frames"].as_array().unwrap()).find(|frame| number(&frame["psnr"]) >= 30.0).unwrap();
+    assert!(reached["ssim"].is_number() && verdict.contains("relMSE ") && verdict.contains(", SSIM "), "{reached} {verdict}");
+    // Drawn anew from its file, without the scene.
+    let again = folder.path().join("again");
+    run(&mut ridgewatch(["chart", text(&out.join("chart.json")), "--out", text(&again)])).success();
+    assert_eq!(json(&again.join("chart.json"))["verdict"], chart["verdict"]);
+    assert!(["chart.svg", "chart.png"].iter().all(|file| again.join(file).exists()));
+    let [first, second] = [&out, &again].map(|folder| std::fs::read_to_string(folder.join("chart.csv")).unwrap());
+    assert_eq!(first.lines().count(), second.lines().count());
+    for (one, other) in first.split([',', '\n']).zip(second.split([',', '\n'])) {
+        // The last digit of a number in JSON may be another one.
+        let is_close = || one.parse::<f64>().is_ok_and(|a| other.parse::<f64>().is_ok_and(|b| (a - b).abs() <= 2e-6 * a.abs()));
+        assert!(one == other || is_close(), "{one}, then {other}");
+    }
+}
+
+/// What `auto` draws as a map is not said to begin with a method of volumes.
+#[test]
+fn a_flat_scene_is_said_to_be_drawn_as_a_map() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, scene) = (folder.path().join("chart"), folder.path().join("flat.toml"));
+    let keys = "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 5\n[render]\nwidth = 32\nheight = 16\n";
+    std::fs::write(&scene, keys).unwrap();
+    let chart = ["chart", text(&scene), "--device", "cpu", "--only", "pictures", "--seconds", "8", "--out", text(&out)];
+    run(&mut ridgewatch(chart)).success();
+    let verdict = json(&out.join("chart.json"))["verdict"].to_string();
+    assert!(verdict.contains("draws this scene as a map") && !verdict.contains("begins with"), "{verdict}");
 }
 
 /// Of snapshots that are left out the chart says what they were worth.
@@ -143,6 +171,8 @@ fn the_error_of_fewer_snapshots_falls_with_their_number() {
         assert!(svg.contains(&format!("Cost of a sample against {against}, steps by error")), "{against}");
     }
     assert!(found[1].1 > 0.0 && found[1].1 < 0.7 * found[0].1, "{found:?}");
+    let tables: Vec<f64> = points.iter().map(|point| number(&point["table_rms"])).collect();
+    assert!(tables.iter().all(|rms| *rms > 0.0) && chart["verdict"].to_string().contains(" samples on, with rms "), "{tables:?}");
     assert!(chart["verdict"].to_string().contains("rms from that of all snapshots"), "{}", chart["verdict"]);
 }
 
@@ -189,4 +219,7 @@ fn what_cannot_be_charted_is_refused() {
     run(&mut ridgewatch(["chart", config("live.toml").as_str(), "--out", text(folder.path())]))
         .refused(2, &["running simulation", "accepted"]);
     run(&mut ridgewatch(command("chart", &folder.path().join("chart"), &["--only", "speed"]))).refused(2, &["speed", "ftle"]);
+    let other = folder.path().join("other.json");
+    std::fs::write(&other, "{\"scene\": 1}").unwrap();
+    run(&mut ridgewatch(["chart", text(&other), "--out", text(folder.path())])).refused(1, &["other.json is no chart.json", "line 1"]);
 }
