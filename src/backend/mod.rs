@@ -248,7 +248,7 @@ pub struct Smooth {
     pub nodes: [usize; 3],
     /// Most of these nodes that are traced when a picture starts, where the gate does not trust the surrogate.
     pub traced_nodes: usize,
-    /// Seconds that the frame should take, if they are limited. On the CPU marching keeps to them; on a device it takes milliseconds.
+    /// Seconds that the frame should take, if they are limited. On the CPU marching keeps to them over the frames; on a device it takes milliseconds.
     pub budget: Option<f64>,
 }
 

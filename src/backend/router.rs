@@ -109,7 +109,8 @@ pub struct Tally {
     pub over_budget: u64,
     /// Nodes of a laid out network that were traced, since it was not trusted there, those in missing cells included. They are no queries.
     pub nodes: u64,
-    /// Share of all its nodes that show it although it is not trusted there, since they are not traced yet. `None` of other pictures.
+    /// Share of all its nodes in bricks that reach into cells where it was not trusted when the picture started, and are not traced yet. `None` of other
+    /// pictures.
     pub untraced_share: Option<f64>,
     /// Seconds of tracing: wall clock on the CPU, device time on a GPU.
     pub trace_seconds: f64,

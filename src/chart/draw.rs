@@ -300,7 +300,7 @@ const LETTER: f64 = 6.6;
 const MARKER: i32 = 7;
 
 /// A rectangle in pixels: left, top, right, bottom.
-type Box = [i32; 4];
+type Rectangle = [i32; 4];
 
 /// Size of a label in pixels, from above.
 fn label_size(text: &str) -> [i32; 2] {
@@ -308,7 +308,7 @@ fn label_size(text: &str) -> [i32; 2] {
 }
 
 /// Corner of a label beside a point, so that it lies within `area` and on nothing in `taken`; `None` if there is no room.
-fn beside((x, y): (i32, i32), text: &str, area: Box, taken: &[Box]) -> Option<(i32, i32)> {
+fn beside((x, y): (i32, i32), text: &str, area: Rectangle, taken: &[Rectangle]) -> Option<(i32, i32)> {
     let [width, height] = label_size(text);
     let corners = [
         (x + MARKER, y - height - 2),
@@ -321,7 +321,7 @@ fn beside((x, y): (i32, i32), text: &str, area: Box, taken: &[Box]) -> Option<(i
     corners.into_iter().find(|&(left, top)| {
         let own = [left, top, left + width, top + height];
         let is_within = own[0] >= area[0] && own[1] >= area[1] && own[2] <= area[2] && own[3] <= area[3];
-        let is_apart = |other: &Box| own[2] <= other[0] || other[2] <= own[0] || own[3] <= other[1] || other[3] <= own[1];
+        let is_apart = |other: &Rectangle| own[2] <= other[0] || other[2] <= own[0] || own[3] <= other[1] || other[3] <= own[1];
         is_within && taken.iter().all(is_apart)
     })
 }
@@ -359,7 +359,7 @@ where
     let area = [left, top, right, bottom];
     let is_drawn = |(x, y): &(f64, f64)| x.is_finite() && y.is_finite();
     let markers = panel.series.iter().filter(|series| !series.is_line || series.points.len() <= MARKED).flat_map(|series| &series.points);
-    let mut taken: Vec<Box> = markers
+    let mut taken: Vec<Rectangle> = markers
         .filter(|at| is_drawn(at))
         .map(|at| {
             let (x, y) = plot.backend_coord(at);

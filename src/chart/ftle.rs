@@ -42,8 +42,9 @@ const REUSE: u64 = 4;
 /// Labels before the first training, and most fresh ones afterwards.
 const FIRST_LABELS: usize = 1 << 16;
 const MAX_FRESH: usize = 1 << 24;
-/// A small network has at most 2^-4 of the entries, and a table of 2^-5 or less.
+/// A small network has a table of 2^-5 or less, and one sixteenth of the entries of all levels at most.
 const SMALLER: u32 = 5;
+const FEWER: usize = 16;
 /// What is said of methods that ran on the CPU in a chart of a GPU.
 #[cfg(feature = "cuda")]
 const ON_THE_CPU: &str = ", on the CPU";
@@ -580,7 +581,7 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
     // Levels that are stored densely do not shrink with the table at once.
     let sizes = (4..=suited.log2_table().saturating_sub(SMALLER).max(4)).rev();
     let mut smaller = sizes.map(|log2_table| NetworkSettings { log2_table: Some(log2_table), ..suited.clone() });
-    let small = smaller.find(|network| entries(network) << (SMALLER - 1) <= entries(&suited));
+    let small = smaller.find(|network| entries(network) * FEWER <= entries(&suited)).filter(|_| entries(&suited) > 0);
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene };
     let narrow = NetworkSettings { hidden_layers: 4, width: 64, ..frequency.clone() };
     let mut variants = vec![
@@ -634,7 +635,7 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
 fn thousands(count: usize) -> String {
     match count {
         0..10_000 => count.to_string(),
-        10_000..1_000_000 => format!("{:.0}k", count as f64 / 1e3),
+        10_000..999_500 => format!("{:.0}k", count as f64 / 1e3),
         _ => format!("{:.1}M", count as f64 / 1e6),
     }
 }

@@ -360,7 +360,7 @@ fn measure(
     frames: &mut Vec<PicturePoint>,
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
-    let (mut seconds, mut last, mut highest) = (0.0, None, f64::NEG_INFINITY);
+    let (mut seconds, mut last, mut before) = (0.0, None, f64::NEG_INFINITY);
     let ssim = |film: &Film, tone_map| compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
     let bytes = still(scene.clone(), options, (slides, 0), |frame| {
         let record = &frame.record;
@@ -369,8 +369,8 @@ fn measure(
         let accumulated = scene.render.method.is_smooth() || sum.accumulate(&frame.film).is_err();
         let film = if accumulated { &*frame.film } else { &sum };
         let errors = picture_errors(film, truth, frame.tone_map);
-        let is_first = TARGETS.iter().any(|target| (highest..=errors.psnr).contains(target));
-        highest = highest.max(errors.psnr);
+        let reaches = TARGETS.iter().any(|target| before < *target && *target <= errors.psnr);
+        before = errors.psnr;
         let own = record.samples_per_pixel * (record.frame + 1) as f64;
         frames.push(PicturePoint {
             seconds,
@@ -378,7 +378,7 @@ fn measure(
             psnr: errors.psnr,
             psnr_all: errors.psnr_all,
             relmse: errors.relmse,
-            ssim: is_first.then(|| ssim(film, frame.tone_map)).flatten(),
+            ssim: reaches.then(|| ssim(film, frame.tone_map)).flatten(),
             stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
         });
         last = Some((frame.film.clone(), frame.tone_map));

@@ -65,7 +65,8 @@ pub struct ScalingPoint {
     pub table_ns: f64,
     /// Seconds to trace the table.
     pub table_seconds: f64,
-    /// Root mean square error of the FTLE from it, against that of the same tracing, 1/time; `None` in charts of before.
+    /// Root mean square error of the FTLE from it, against that of the same tracing, 1/time; `None` in earlier charts, and if no
+    /// point has a finite value.
     #[serde(default)]
     pub table_rms: Option<f64>,
     /// Samples from which on the table is cheaper, its tracing included; `None` if it never is.
@@ -211,7 +212,7 @@ struct Costs {
     trace: f64,
     table: f64,
     table_seconds: f64,
-    table_rms: f64,
+    table_rms: Option<f64>,
 }
 
 impl Costs {
@@ -224,7 +225,7 @@ impl Costs {
             trace_ns: 1e9 * self.trace,
             table_ns: 1e9 * self.table,
             table_seconds: self.table_seconds,
-            table_rms: Some(self.table_rms),
+            table_rms: self.table_rms,
             table_pays_from: (saved > 0.0).then(|| self.table_seconds / saved),
             rms: None,
         }
@@ -270,6 +271,6 @@ fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, is_gpu: bool,
     frozen.predict(&unit[..COMPARED], &mut values[..COMPARED])?;
     let squares = traced.log_stretch.iter().zip(&values).map(|(a, b)| f64::from(a - b).powi(2)).filter(|square| square.is_finite());
     let (sum, count) = squares.fold((0.0, 0_usize), |(sum, count), square| (sum + square, count + 1));
-    let table_rms = (sum / count.max(1) as f64).sqrt() / tracer.flow().tau();
+    let table_rms = (count > 0).then(|| (sum / count as f64).sqrt() / tracer.flow().tau());
     Ok(Some(Costs { steps: tracer.flow().steps(), trace, table, table_seconds, table_rms }))
 }

@@ -1,4 +1,4 @@
-//! `ridgewatch chart`: speed against accuracy of a scene, and the pick; or a chart of before, drawn anew.
+//! `ridgewatch chart`: speed against accuracy of a scene, and the pick; or an earlier chart, drawn anew.
 
 use super::common::{CHART, Common, Interrupted, RaceFile, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
 use super::messages;
@@ -18,7 +18,8 @@ const STOP_WITHIN: Duration = Duration::from_secs(60);
 /// Options of `chart`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// A scene file (.toml), or data files, globs and URLs of Zarr stores; or a chart.json, which is drawn anew without measuring.
+    /// A scene file (.toml), or data files, globs and URLs of Zarr stores; or a chart.json, which is drawn anew without
+    /// measuring, so that of the other options only --out and --json count.
     #[arg(required = true, value_name = "CONFIG | FILES | CHART.json")]
     paths: Vec<PathBuf>,
     /// Seconds for all measurements. What did not fit is named.

@@ -19,8 +19,8 @@ const LAYERS_WAIT: Duration = Duration::from_secs(4);
 const MAX_LAYERS_BYTES: usize = 192 << 20;
 /// Shortest time between two attempts to subscribe.
 const RECONNECT: Duration = Duration::from_millis(500);
-/// The same after a connection that seems too slow for them, which would otherwise be busy with them for ever.
-const RECONNECT_SLOW: Duration = Duration::from_secs(30);
+/// Time until the next attempt after a connection that seems too slow for them, which would otherwise be busy with them for ever.
+const RECONNECT_SLOW: Duration = Duration::from_secs(15);
 /// A connection that ends after this time without any seems too slow.
 const SLOW: Duration = Duration::from_secs(2);
 
@@ -58,7 +58,8 @@ impl Layers {
     /// Says that a page needs them. Waits a moment for the first, unless the publisher is not reached.
     pub async fn need(&self) {
         if !is_recent(*self.needed.borrow()) {
-            self.wish.send_if_modified(|wish| std::mem::replace(wish, Wish::Open) != Wish::Open);
+            // What seemed too slow is not asked for now.
+            self.wish.send_if_modified(|wish| *wish != Wish::CutOff && std::mem::replace(wish, Wish::Open) != Wish::Open);
         }
         self.needed.send_replace(Some(Instant::now()));
         let _ = timeout(LAYERS_WAIT, self.wish.subscribe().wait_for(|wish| *wish != Wish::Open)).await;
@@ -98,22 +99,22 @@ impl Hub {
             // Its sender is in the hub.
             let _ = needed.wait_for(|needed| is_recent(*needed)).await;
             let begin = Instant::now();
-            let (wish, pause) = match Subscriber::connect(self.endpoint(), &[LAYERS_TOPIC], MAX_LAYERS_BYTES).await {
+            let (wish, next) = match Subscriber::connect(self.endpoint(), &[LAYERS_TOPIC], MAX_LAYERS_BYTES).await {
                 Ok(subscriber) => match self.take_while_needed(subscriber).await {
-                    Ok(()) => (Wish::Open, RECONNECT),
+                    Ok(()) => (Wish::Open, begin + RECONNECT),
                     Err(error) => {
                         tracing::debug!("layers: {error}");
                         let is_slow = *layers.wish.borrow() != Wish::Met && begin.elapsed() > SLOW;
-                        if is_slow { (Wish::CutOff, RECONNECT_SLOW) } else { (Wish::Unreached, RECONNECT) }
+                        if is_slow { (Wish::CutOff, Instant::now() + RECONNECT_SLOW) } else { (Wish::Unreached, begin + RECONNECT) }
                     }
                 },
                 Err(error) => {
                     tracing::debug!("layers: {error}");
-                    (Wish::Unreached, RECONNECT)
+                    (Wish::Unreached, begin + RECONNECT)
                 }
             };
             layers.wish.send_replace(wish);
-            sleep_until(begin + pause).await;
+            sleep_until(next).await;
         }
     }
 

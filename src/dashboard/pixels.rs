@@ -28,8 +28,7 @@ const MAX_PICTURES: usize = 64;
 const TOO_LARGE: &str = "the run publishes layers of pictures of up to 4194304 pixels; with --dashboard it serves those of larger ones";
 /// Of layers that were asked for.
 pub(super) const NOT_REACHED: &str = "the run is not reached";
-pub(super) const CUT_OFF: &str =
-    "the connection to the run ended before its layers had come: it may be too slow for them (publish.stall_seconds of the run)";
+pub(super) const CUT_OFF: &str = "the connection to the run ended before its layers had come: the run has ended, or the link is too slow for them (publish.stall_seconds of the run)";
 pub(super) const NOT_COME: &str = "the layers of its newest frame have not come: try again (a run of an earlier version sends none)";
 /// Of what is not sent.
 pub(super) const NO_WINDOW: &str = "only a run with --dashboard has it, since it is traced in the run's window";

@@ -143,9 +143,11 @@ fn figures(line: &RidgeLine, about: &RidgesAbout) -> [f64; 3] {
 /// Lines as legacy VTK polydata. On the sphere, coordinates are degrees. The FTLE is in 1 / time unit of the source.
 pub fn vtk(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let points: Vec<&RidgePoint> = lines.iter().flat_map(|line| &line.points).collect();
-    let facts = [about.title.clone(), about.when.clone()].into_iter().chain(about.texts().map(|(name, text)| format!("{name} {text}")));
+    let facts = about.texts().map(|(name, text)| format!("{name} {text}")).chain([about.when.clone(), about.title.clone()]);
     let facts: Vec<_> = std::iter::once("ridgewatch FTLE ridges".to_owned()).chain(facts).filter(|fact| !fact.is_empty()).collect();
-    let title: String = facts.join(", ").chars().filter(|c| *c != '\n').take(200).collect();
+    // A line of at most 256 bytes.
+    let line = facts.join(", ").replace('\n', " ");
+    let title = &line[..line.floor_char_boundary(250)];
     let mut text = format!("# vtk DataFile Version 3.0\n{title}\nASCII\nDATASET POLYDATA\nPOINTS {} double\n", points.len());
     // Writing to a string does not fail.
     for point in &points {
@@ -219,7 +221,7 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
         variable.put_attribute("long_name", about.axes[axis][0].as_str())?;
         if about.is_geographic {
             variable.put_attribute("standard_name", ["longitude", "latitude"][axis])?;
-        } else if about.mapping.is_some() {
+        } else if about.mapping.as_ref().is_some_and(|mapping| mapping.kind() != "latitude_longitude") {
             variable.put_attribute("standard_name", ["projection_x_coordinate", "projection_y_coordinate"][axis])?;
         }
         variable.put_attribute(

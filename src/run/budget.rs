@@ -34,8 +34,8 @@ impl FrameCost {
     }
 
     /// The cost to expect after this frame and what was expected `before`. The first frame of a picture marches most, so that less is believed
-    /// at once. The march may also take as long as the samples, so that more is believed by half: otherwise few and many samples would take
-    /// turns.
+    /// at once. On a device the march, which is part of the rest there, may also take as long as the samples, so that more is believed by half:
+    /// otherwise few and many samples would take turns.
     pub(super) fn after(self, before: Option<Self>) -> Self {
         let rest = before.map_or(self.rest, |before| self.rest.min(0.5 * (before.rest + self.rest)));
         Self { rest, ..self }

@@ -93,7 +93,8 @@ pub struct FrameRecord {
     pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
     pub trusted_volume: f64,
-    /// Share of the nodes of a laid out network that show it although it is not trusted there, since they are not traced yet. `None` of other pictures.
+    /// Share of the nodes of a laid out network that lie in bricks which reach into cells that were not trusted when the picture started, and are not
+    /// traced yet. `None` of other pictures.
     #[serde(default)]
     pub untraced_share: Option<f64>,
     /// `trusted_error` on new points with the same weights, measured after the frame (`--verify`).

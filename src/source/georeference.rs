@@ -202,7 +202,7 @@ impl GridMapping {
     }
 
     /// Name of the projection by the CF conventions.
-    pub(crate) fn kind(&self) -> &str {
+    pub fn kind(&self) -> &str {
         match self.attributes.iter().find(|(n, _)| n == "grid_mapping_name") {
             Some((_, MappingValue::Text(text))) => text,
             _ => "",

@@ -139,7 +139,7 @@ export function windowWords(record) {
 }
 
 /** What of the picture rests on a network that is not trusted there. */
-const untracedWords = (record) => (record.untraced_share > 0 ? `; ${percent(record.untraced_share)} of the nodes show a network that is not trusted there` : "");
+const untracedWords = (record) => (record.untraced_share > 0 ? `; ${percent(record.untraced_share)} of the nodes, about what is not trusted, still show the network` : "");
 
 /** Rows of the table beside the picture: term, text. */
 export function facts(record, header) {

@@ -160,7 +160,8 @@ impl MarchControl {
         Self { step: self.step, ..Self::default() }
     }
 
-    /// The control of the same view of other nodes. It gets as many rays at once, so that the picture becomes no coarser than it was.
+    /// The control of the same view of other nodes. It gets as many rays at once, so that the picture becomes no coarser than it was, or as many as a
+    /// budget has time for.
     pub fn on_other_nodes(&self) -> Self {
         Self { next_rays: self.rays.clamp(MIN_RAYS, MAX_RAYS), ..self.restarted() }
     }

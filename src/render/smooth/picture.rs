@@ -29,7 +29,7 @@ pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
 const MAX_PAIRS: usize = 1 << 19;
 /// Seconds of marching that a round may take at least, and the same as a share of the seconds that it has. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
-const MIN_MARCH_SHARE: f64 = 0.25;
+const MIN_MARCH_SHARE: f64 = 0.1;
 /// Pixels of which one leaves a mark of progress.
 const MARKED: usize = 1 << 10;
 
@@ -172,7 +172,7 @@ impl Picture {
             (stats.march_seconds, stats.march_goes_on) = (marching, self.march.is_due() || allowed < marching);
         }
         // What is needed for a picture at all is not paid back.
-        self.credit = if begins { 0.0 } else { allowed - marching };
+        self.credit = if begins || round.budget.is_none() { 0.0 } else { allowed - marching };
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
     }
@@ -180,7 +180,8 @@ impl Picture {
     /// As many rays as it had on other nodes, or as many again, may take too long at once.
     fn march_at_most(&mut self, seconds: f64) {
         if let Some(each) = self.ray_seconds {
-            let most = (seconds / each) as u64 / PAIR * PAIR;
+            // Rays come in fours.
+            let most = (seconds / each) as u64 / MIN_RAYS * MIN_RAYS;
             self.march.next_rays = self.march.next_rays.min(most.max(MIN_RAYS));
         }
     }
