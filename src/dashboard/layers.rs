@@ -58,7 +58,7 @@ impl Layers {
     /// Says that a page needs them. Waits a moment for the first, unless the publisher is not reached.
     pub async fn need(&self) {
         if !is_recent(*self.needed.borrow()) {
-            // What seemed too slow is not asked for now.
+            // A link that seemed too slow waits for its next attempt.
             self.wish.send_if_modified(|wish| *wish != Wish::CutOff && std::mem::replace(wish, Wish::Open) != Wish::Open);
         }
         self.needed.send_replace(Some(Instant::now()));
