@@ -176,6 +176,8 @@ pub struct ArchiveSettings {
     /// Levels that follow the terrain (WRF) or the bottom of the sea: heights of the grid in metres, negative below the surface of the sea; by default
     /// the mean heights of the levels.
     pub heights: Option<Vec<f64>>,
+    /// Value of the velocities' variables, as it is stored, where there is no velocity, beside those that the file names.
+    pub fill_value: Option<f64>,
     /// WRF: grid for the components on faces.
     pub staggering: Staggering,
     /// Curvilinear longitudes and latitudes: spacing in degrees of the resampled grid; by default chosen by its error.

@@ -120,6 +120,19 @@ fn units_are_stated() {
     assert_eq!(open(&[flat]).grid().geometry, Geometry::Cartesian);
 }
 
+#[test]
+fn a_fill_value_that_the_file_does_not_name_is_stated() {
+    let dir = tempdir().unwrap();
+    let axes: [(&str, &str, &[f64]); 3] = [("time", HOURS, &[0.0, 1.0]), ("y", "m", &X), ("x", "m", &X)];
+    let mut u: Vec<f64> = (0..18).map(|i| f64::from(i) / 10.0).collect();
+    (u[1], u[4], u[10]) = (-9999.9, -9999.9, -9999.9);
+    let file = Fixture::on(CLASSIC, &axes).winds(f32s(u), f32s(vec![0.5; 18])).write(&dir.path().join("filled.nc"));
+    let node = |more: &str, node: usize| open_with(&[&file], more).read(0).unwrap().nodes[node];
+    assert_eq!(node("", 4)[0], -9999.9, "taken as it is, with a warning");
+    assert!(node("fill_value = -9999.9", 4)[3].is_nan(), "missing");
+    assert_eq!(node("fill_value = -9999.9", 3)[0], 0.3);
+}
+
 const NX: usize = 12;
 const NY: usize = 10;
 

@@ -2,6 +2,7 @@
 
 use super::check::{check, check_fit};
 use super::files::expand;
+use super::fills::unnamed_fill;
 use super::follow::{Followed, Stamp, stamps};
 use super::group::{Group, grouped, open_group};
 use super::limits;
@@ -89,6 +90,8 @@ pub struct Archive {
     pub(super) settings: ArchiveSettings,
     /// Layout of the first file.
     pub(super) first: Layout,
+    /// Set once a snapshot was searched for fill values that the file does not name.
+    fills_sought: bool,
     /// Set if further snapshots may come.
     pub(super) followed: Option<Box<Followed>>,
 }
@@ -259,6 +262,7 @@ impl Archive {
             settings: settings.clone(),
             first: reference,
             files,
+            fills_sought: false,
             followed,
         };
         if let Some(what) = synthetic {
@@ -540,6 +544,18 @@ impl Archive {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
             None => plans.iter().map(|plan| read_levels(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
         };
+        if !std::mem::replace(&mut self.fills_sought, true) {
+            for (values, axis) in components.iter().zip(["x", "y", "z"]) {
+                if let Some((fill, share)) = unnamed_fill(values) {
+                    tracing::warn!(
+                        "{}: the velocity along {axis} is {fill} at {:.1} % of the nodes, which looks like a fill value that the file does not name; \
+                         archive.fill_value = {fill} takes it as missing",
+                        self.files[place.file].path.display(),
+                        100.0 * share
+                    );
+                }
+            }
+        }
         if let Some(ground_to_grid) = &self.ground_to_grid {
             ground_to_grid.apply(&mut components);
         }

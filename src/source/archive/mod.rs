@@ -8,6 +8,7 @@ mod archive;
 mod check;
 mod every;
 mod files;
+mod fills;
 mod follow;
 mod group;
 mod inspect;

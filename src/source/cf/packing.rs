@@ -64,6 +64,15 @@ impl Packing {
         Ok(Self { scale, offset, missing, valid: (low, high), wrap })
     }
 
+    /// The same with a further number, as it is stored, that stands for a missing value.
+    pub fn with_missing(mut self, number: NumberType, fill: Option<f64>) -> Self {
+        // In the precision of the file.
+        let stored = |fill: f64| if number == NumberType::Float32 { f64::from(fill as f32) } else { fill };
+        let wrap = self.wrap;
+        self.missing.extend(fill.map(stored).map(|fill| if fill < 0.0 { fill + wrap } else { fill }));
+        self
+    }
+
     /// The value; NaN if it is missing.
     pub fn unpack(&self, raw: f64) -> f64 {
         let raw = if raw < 0.0 { raw + self.wrap } else { raw };

@@ -165,7 +165,8 @@ impl<'a> Planner<'a> {
 
     /// Packing of a variable.
     pub fn packing(&self, variable: usize) -> Result<Packing, SourceError> {
-        Packing::of(self.variable(variable)).map_err(|what| self.misfit(variable, what))
+        let packing = Packing::of(self.variable(variable)).map_err(|what| self.misfit(variable, what))?;
+        Ok(packing.with_missing(self.variable(variable).number, self.settings.fill_value))
     }
 
     /// True if longitudes that close the circle are periodic.
