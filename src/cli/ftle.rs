@@ -8,9 +8,9 @@ use ridgewatch::field::DomainPoint;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::publish::{FieldExport, FieldFormat, FieldFrame, SeedField, seeds};
-use ridgewatch::run::{Plan, RunError, Setup, Slide};
+use ridgewatch::run::{Plan, RunError, Setup, Slide, short_lived};
 use ridgewatch::setting::word;
-use ridgewatch::source::utc;
+use ridgewatch::source::{self, utc};
 use ridgewatch::surrogate::Trace;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -42,8 +42,8 @@ pub struct Options {
     /// File of the field, with its lifetimes and errors (those of each seed with --check); by default nothing is written.
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Format of the file: netcdf (CF conventions), vti, vtr or vts (VTK image data, rectilinear, structured), or vtk for vti; by default that of
-    /// its extension, and netcdf for others.
+    /// Format of the file: netcdf (CF conventions), vti, vtr or vts (VTK image data, rectilinear, structured), or vtk for vti. Default: that of
+    /// its extension, .nc, .vti, .vtr or .vts.
     #[arg(long, value_name = "FORMAT", value_parser = format, requires = "out")]
     format: Option<FieldFormat>,
 }
@@ -143,6 +143,12 @@ struct Convergence {
 
 /// Computes, compares and writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
+    let format = options
+        .out
+        .as_ref()
+        .filter(|_| options.format.is_none())
+        .map(|out| FieldFormat::of(out).map_err(|why| Usage(format!("--out {}: {why}", out.display()))));
+    let format = format.transpose()?.or(options.format).unwrap_or(FieldFormat::NetCdf);
     let scene = scene(common, &options.paths)?;
     let faulty = |error| located(&scene, error, RunError::refused);
     let Setup { plan, mut slides, notes, .. } = open(&scene)?;
@@ -181,13 +187,14 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         if index < wanted.first {
             continue;
         }
-        let report = compute(&plan, &slide, options, &device, &bar, &mut export).map_err(|error| match error.downcast::<RunError>() {
-            Ok(error) => located(&scene, error, RunError::refused),
-            Err(error) => match error.downcast::<FlowError>() {
-                Ok(error) => located(&scene, error, FlowError::refused),
-                Err(error) => error,
-            },
-        })?;
+        let report =
+            compute(&plan, &slide, options, format, &device, &bar, &mut export).map_err(|error| match error.downcast::<RunError>() {
+                Ok(error) => located(&scene, error, RunError::refused),
+                Err(error) => match error.downcast::<FlowError>() {
+                    Ok(error) => located(&scene, error, FlowError::refused),
+                    Err(error) => error,
+                },
+            })?;
         if !common.json {
             bar.suspend(|| print_report(&report));
         }
@@ -195,6 +202,12 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         bar.inc(1);
     }
     bar.finish_and_clear();
+    if let Some(first) = export.as_ref().and_then(FieldExport::left_over) {
+        messages::note(format_args!(
+            "{} and what follows it are of an earlier, longer series, and the .pvd does not name them",
+            first.display()
+        ));
+    }
     let file = export.map(FieldExport::finish).transpose()?;
     match (&file, common.json, options.slides) {
         (Some(file), false, _) => print_text(format_args!("written to {}", file.display())),
@@ -216,6 +229,7 @@ fn compute(
     plan: &Plan,
     slide: &Slide,
     options: &Options,
+    format: FieldFormat,
     device: &Device,
     bar: &indicatif::ProgressBar,
     export: &mut Option<FieldExport>,
@@ -246,6 +260,9 @@ fn compute(
         device.trace(&slide.velocity, &plan.map, slide.time, &seeds, &AtomicBool::new(false)).map_err(RunError::of)?;
     note.into_iter().for_each(|note| bar.suspend(|| messages::note(note)));
     let found = SeedField::new(&*tracer, &seeds, traced);
+    let lived = found.lifetime_share.iter().zip(&found.missing).filter(|(_, missing)| !**missing);
+    let (lives, count) = lived.fold((0.0, 0), |(sum, count), (share, _)| (sum + f64::from(*share), count + 1));
+    short_lived(lives / f64::from(count)).into_iter().for_each(|note| bar.suspend(|| messages::note(note)));
     let known: Vec<f64> = found.ftle.iter().copied().filter(|f| f.is_finite()).collect();
     let missing = found.missing.iter().filter(|missing| **missing).count();
     if options.check || options.convergence {
@@ -260,7 +277,6 @@ fn compute(
             Some(export) => export,
             None => {
                 let frame = FieldFrame::new(plan, slide, grid, history(), truth.as_ref().map(|(name, _)| *name));
-                let format = options.format.unwrap_or_else(|| FieldFormat::of(out));
                 export.insert(FieldExport::create(out, format, frame, options.slides.is_some())?)
             }
         };
@@ -378,9 +394,8 @@ fn print_report(report: &Report) {
     let [nx, ny, nz] = report.grid;
     let when = report.date.clone().unwrap_or_else(|| format!("t0 = {}", report.time));
     print_text(format_args!(
-        "{when}, tau = {}{}: {}, {}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
-        report.tau,
-        if report.time_unit.is_empty() { String::new() } else { format!(" {}", report.time_unit) },
+        "{when}, tau = {}: {}, {}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
+        source::duration(report.tau, &report.time_unit),
         word(report.integrator),
         word(report.precision),
         report.steps,
@@ -390,7 +405,8 @@ fn print_report(report: &Report) {
     if let Some(difference) = report.integration_difference {
         messages::note(chosen_steps(report.steps as u64, difference, None));
     }
-    print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
+    let per = if report.time_unit.is_empty() { String::new() } else { format!(" 1/{}", report.time_unit) };
+    print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}{per}", report.minimum, report.maximum, report.mean));
     if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {
         print_text(format_args!(
             "{} seeds without velocity; {:.2} % of the particles stopped early",
@@ -407,7 +423,8 @@ fn print_report(report: &Report) {
         print_text(format_args!("against {}: rms {:.3e}, maximum {:.3e}{relative}{psnr}", check.truth, check.rms, check.maximum));
     }
     if let Some(c) = &report.convergence {
-        print_text(format_args!("against {}, f64:", c.truth));
+        let f64 = if c.truth.ends_with("f64") { "" } else { ", steps in f64" };
+        print_text(format_args!("against {}{f64}:", c.truth));
         for (k, (steps, rms)) in c.steps.iter().zip(&c.rms).enumerate() {
             let order = if k > 0 { format!("   order {:.2}", c.order[k - 1]) } else { String::new() };
             print_text(format_args!("  {steps:>4} steps   rms {rms:.3e}{order}"));

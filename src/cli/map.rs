@@ -26,7 +26,8 @@ pub struct Options {
     /// Slide of the window, from 0.
     #[arg(long, default_value_t = 0, value_name = "N")]
     slide: u64,
-    /// Durations side by side, in time units of the source or with a unit: `--tau "10 days,20 days"`. Default: the scene's.
+    /// Durations side by side: `--tau "10 days,20 days"`. Plain numbers are seconds for data with dates, else time units of the source. Default:
+    /// the scene's.
     #[arg(long, value_delimiter = ',', value_parser = time_span)]
     tau: Vec<TimeSpan>,
     /// forward (repelling structures) or backward (attracting ones). Default: the scene's.
@@ -35,7 +36,7 @@ pub struct Options {
     /// Forward FTLE in red and backward FTLE in blue, in one picture. Archives have to span twice tau.
     #[arg(long)]
     both: bool,
-    /// Coordinate along the third axis, for flows in three dimensions (metres for pressure levels). Default: the middle.
+    /// Coordinate along the third axis, for flows in three dimensions (metres for pressure levels). Default: the middle one of the data's levels.
     #[arg(long, value_name = "Z", allow_negative_numbers = true)]
     level: Option<f64>,
     /// auto, plate_carree, mercator, lambert, polar, or plain (the coordinates themselves).
@@ -62,9 +63,9 @@ pub struct Options {
     /// Write the ridge lines: .geojson, .nc (CF geometries) or .vtk. Includes --ridges.
     #[arg(long, value_name = "FILE")]
     lines: Option<PathBuf>,
-    /// Percentile of the FTLE that --ridge-length of a ridge line reaches.
-    #[arg(long, value_name = "P", default_value_t = Strength::LINES.percentile, value_parser = percentile)]
-    ridge_percentile: f64,
+    /// Percentile of the FTLE that --ridge-length of a ridge line reaches. Default: 80.
+    #[arg(long, value_name = "P", value_parser = percentile)]
+    ridge_percentile: Option<f64>,
     /// Least length of a ridge line that reaches the percentile, in nodes of the ridge grid. Default: 30; a cell of the data at least, where its cells
     /// resolve the FTLE.
     #[arg(long, value_name = "NODES", value_parser = not_negative)]
@@ -151,6 +152,16 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     refuse_live(&scene, "map")?;
     let record_file = options.out.with_extension("json");
+    let draws_ridges = options.ridges || options.lines.is_some();
+    let about_ridges = [
+        ("--ridge-percentile", options.ridge_percentile.is_some()),
+        ("--ridge-length", options.ridge_length.is_some()),
+        ("--ridge-smoothing", options.ridge_smoothing.is_some()),
+        ("--ridge-grid", options.ridge_grid.is_some()),
+    ];
+    if let Some((name, _)) = about_ridges.into_iter().find(|(_, given)| *given && !draws_ridges) {
+        bail!(Usage(format!("{name}: the map has no ridge lines; accepted with --ridges or --lines FILE")));
+    }
     for out in [Some(&options.out), options.lines.as_ref()].into_iter().flatten() {
         check_folder(out)?;
     }
@@ -167,7 +178,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
         None => None,
     };
-    let strength = Strength { percentile: options.ridge_percentile, ..Strength::LINES.with(options.ridge_smoothing, options.ridge_length) };
+    let strength = Strength::LINES.with(options.ridge_smoothing, options.ridge_length);
+    let strength = Strength { percentile: options.ridge_percentile.unwrap_or(strength.percentile), ..strength };
     let wanted = MapOptions {
         pixels: options.width as usize,
         sampling: Sampling { seeds: options.seeds, seed: scene.seed },
@@ -177,7 +189,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         range: options.range,
         contours: options.contour.clone(),
         arrows: options.arrows,
-        ridges: (options.ridges || options.lines.is_some()).then_some(strength),
+        ridges: draws_ridges.then_some(strength),
         ridge_grid: options.ridge_grid,
     };
     let bar = messages::progress(Some(1));
@@ -189,12 +201,13 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     })
     .map_err(|error| explained(&scene, error))?;
     bar.finish_and_clear();
-    result.notes.iter().for_each(messages::note);
+    result.notes.iter().chain(&result.doubts).for_each(messages::note);
     if wanted.level.is_none()
         && let Some(level) = result.record.level
     {
         let [low, high] = [moment.plan.domain.min[2], moment.plan.domain.max[2]];
-        messages::note(format_args!("--level is not given: {level}, the middle of {low} to {high}"));
+        let [level, low, high] = [level, low, high].map(map::number);
+        messages::note(format_args!("--level is not given: {level} is shown of {low} to {high}"));
     }
     let _drawing = messages::spinner("drawing".into());
     let picture = if extension == "svg" { map::write_svg(&result.figure)?.into_bytes() } else { map::write_png(&result.figure)? };

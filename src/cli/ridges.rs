@@ -28,7 +28,7 @@ pub struct Options {
     /// Slide of the window, from 0.
     #[arg(long, default_value_t = 0, value_name = "N")]
     slide: u64,
-    /// Duration, in time units of the source or with a unit, such as "10 days". Default: the scene's.
+    /// Duration, such as "10 days". A plain number is in seconds for data with dates, else in time units of the source. Default: the scene's.
     #[arg(long, value_parser = time_span)]
     tau: Option<TimeSpan>,
     /// forward (repelling structures) or backward (attracting ones). Default: the scene's.

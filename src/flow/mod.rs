@@ -201,6 +201,19 @@ pub enum VelocitySource {
     Window(Arc<Window>),
 }
 
+impl VelocitySource {
+    /// Names and units of the coordinates; empty where there are none.
+    pub fn axes(&self) -> [[String; 2]; 3] {
+        [0, 1, 2].map(|k| match self {
+            Self::Window(window) => {
+                let axis = window.grid().and_then(|grid| grid.axes.get(k));
+                axis.map_or_else(Default::default, |axis| [axis.name().to_owned(), axis.units().to_owned()])
+            }
+            Self::Analytic(..) => [["x", "y", "z"][k].to_owned(), String::new()],
+        })
+    }
+}
+
 /// Results that a trace returns besides the log-stretch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Extras {

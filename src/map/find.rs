@@ -188,7 +188,8 @@ pub fn find(
         seconds: [seconds, start.elapsed().as_secs_f64() - seconds],
     };
     let about = SurfacesAbout { shared: about(moment, rate, level), time: moment.time, tau, direction: map.direction };
-    let notes = tracer.note.take().into_iter().chain(too_coarse(roughness, "--grid")).collect();
+    let doubt = tracer.short_lived();
+    let notes = tracer.note.take().into_iter().chain(doubt).chain(too_coarse(roughness, "--grid")).collect();
     Ok(FoundRidges { ridges, about, record, notes })
 }
 

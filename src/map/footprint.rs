@@ -5,6 +5,7 @@ use crate::backend::{BackendError, Device};
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowMap, Traced, VelocitySource, cpu_tracer};
 use crate::render::footprint;
+use crate::run::short_lived;
 use crate::surrogate::Trace;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -48,6 +49,8 @@ pub struct MapTracer<'a> {
     tracer: Box<dyn Trace>,
     /// Why the CPU traces instead of the device.
     pub note: Option<String>,
+    /// Sum of the lifetime shares of seeds with a velocity, and their number.
+    lifetimes: (f64, u64),
 }
 
 impl<'a> MapTracer<'a> {
@@ -57,7 +60,7 @@ impl<'a> MapTracer<'a> {
     /// The flow map is invalid, or the device fails and the CPU may not take over.
     pub fn new(device: &'a Device, velocity: &'a VelocitySource, map: &'a FlowMap, start: f64) -> Result<Self, BackendError> {
         let (tracer, note) = device.tracer(velocity, map, start)?;
-        Ok(Self { device, velocity, map, start, tracer, note })
+        Ok(Self { device, velocity, map, start, tracer, note, lifetimes: (0.0, 0) })
     }
 
     /// The flow map on the CPU.
@@ -87,12 +90,22 @@ impl<'a> MapTracer<'a> {
         for part in seeds.chunks(AT_ONCE) {
             self.trace(part, &mut traced)?;
             let (flow, tau) = (self.flow(), self.flow().tau() as f32);
+            let from = values.len();
             values.par_extend(
                 part.par_iter().zip(&traced.log_stretch).map(|(seed, s)| if flow.is_missing(*seed) { f32::NAN } else { s / tau }),
             );
+            let lived = values[from..].iter().zip(&traced.lifetime_share).filter(|(value, _)| value.is_finite());
+            let (sum, count) = lived.fold((0.0, 0), |(sum, count), (_, share)| (sum + f64::from(*share), count + 1));
+            self.lifetimes = (self.lifetimes.0 + sum, self.lifetimes.1 + count);
             done(part.len());
         }
         Ok(values)
+    }
+
+    /// Warning about seeds whose particles stop early, of all that were traced.
+    pub fn short_lived(&self) -> Option<String> {
+        let (sum, count) = self.lifetimes;
+        short_lived(sum / count as f64)
     }
 }
 

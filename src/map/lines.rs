@@ -3,6 +3,7 @@
 use super::ridges::RidgePoint;
 use super::words::Rate;
 use crate::publish::add_mapping;
+use crate::publish::vtk_xml::{of_what, unit_texts};
 use crate::source::GridMapping;
 use netcdf::VariableMut;
 use serde_json::json;
@@ -39,8 +40,8 @@ pub struct RidgesAbout {
     pub axes: [[String; 2]; 3],
     /// Where the horizontal coordinates lie on the globe, if the source tells.
     pub mapping: Option<GridMapping>,
-    /// Third coordinate of lines.
-    pub level: f64,
+    /// Third coordinate of lines; `None` in two dimensions.
+    pub level: Option<f64>,
 }
 
 impl RidgesAbout {
@@ -53,16 +54,10 @@ impl RidgesAbout {
 
     /// Names of facts and their texts, for files of VTK and PLY. Their FTLE is in 1 / time unit of the source, as that of fields in VTK files.
     pub(super) fn texts(&self) -> impl Iterator<Item = (&'static str, String)> {
-        let axes = self.axes.iter().filter(|[name, _]| !name.is_empty());
-        let axes = axes.map(|[name, unit]| if unit.is_empty() { name.clone() } else { format!("{name} [{unit}]") });
         let rate = if self.time_unit.is_empty() { String::new() } else { format!("1/{}", self.time_unit) };
-        let texts = [
-            ("coordinates", axes.collect::<Vec<_>>().join(", ")),
-            ("sharpness_unit", self.sharpness_unit(&rate)),
-            ("ftle_unit", rate),
-            ("time_unit", self.time_unit.clone()),
-        ];
-        texts.into_iter().filter(|(_, text)| !text.is_empty())
+        let axes = self.axes.iter().map(|[name, unit]| [name.as_str(), unit]);
+        let sharpness = Some(self.sharpness_unit(&rate)).filter(|unit| !unit.is_empty()).map(|unit| ("sharpness_unit", unit));
+        unit_texts(axes, &self.time_unit).chain(sharpness)
     }
 }
 
@@ -151,7 +146,7 @@ pub fn vtk(lines: &[RidgeLine], about: &RidgesAbout) -> String {
     let mut text = format!("# vtk DataFile Version 3.0\n{title}\nASCII\nDATASET POLYDATA\nPOINTS {} double\n", points.len());
     // Writing to a string does not fail.
     for point in &points {
-        let _ = writeln!(text, "{} {} {}", point.place[0], point.place[1], about.level);
+        let _ = writeln!(text, "{} {} {}", point.place[0], point.place[1], about.level.unwrap_or(0.0));
     }
     let _ = writeln!(text, "LINES {} {}", lines.len(), lines.len() + points.len());
     let mut next = 0;
@@ -189,10 +184,12 @@ pub fn write_netcdf(path: &Path, lines: &[RidgeLine], about: &RidgesAbout) -> Re
     let points: Vec<&RidgePoint> = lines.iter().flat_map(|line| &line.points).collect();
     let mut file = netcdf::create(path)?;
     file.add_attribute("Conventions", "CF-1.8")?;
-    file.add_attribute("title", format!("ridges of the finite-time Lyapunov exponent: {}", about.title))?;
+    file.add_attribute("title", format!("ridges of the finite-time Lyapunov exponent: {}", of_what(&about.title, &about.source)))?;
     file.add_attribute("source", format!("ridgewatch {} from {}", env!("CARGO_PKG_VERSION"), about.source))?;
     file.add_attribute("seed_time", about.when.as_str())?;
-    file.add_attribute("level", about.level)?;
+    if let Some(level) = about.level {
+        file.add_attribute("level", level)?;
+    }
     file.add_dimension("line", lines.len())?;
     file.add_dimension("node", points.len())?;
     let unit = |unit: &str| if unit.is_empty() { "1".to_owned() } else { unit.to_owned() };

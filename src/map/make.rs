@@ -18,7 +18,7 @@ use crate::backend::Device;
 use crate::field::EARTH_RADIUS;
 use crate::flow::{Direction, FlowMap, VelocitySource};
 use crate::render::ProjectionKind;
-use crate::run::{Plan, RunError};
+use crate::run::{Plan, RunError, uniform_ftle};
 use std::path::Path;
 
 /// Most nodes of the grid on which ridges are found: some GiB of memory.
@@ -33,7 +33,7 @@ pub struct MapOptions {
     pub sampling: Sampling,
     /// Projection; `None`: the one that fits.
     pub projection: Option<ProjectionKind>,
-    /// Third coordinate of all seeds; `None`: the middle of the domain. Two-dimensional flows take none.
+    /// Third coordinate of all seeds; `None`: that of the middle level of the data, or of the domain of a closed form. Two-dimensional flows take none.
     pub level: Option<f64>,
     /// Forward and backward FTLE in one picture.
     pub both: bool,
@@ -61,6 +61,8 @@ pub struct MapResult {
     pub about: RidgesAbout,
     /// Remarks for the user.
     pub notes: Vec<String>,
+    /// Remarks on what the colours do not show, and on values that cover less than they seem to. The frames of a run have their own.
+    pub doubts: Vec<String>,
 }
 
 /// One traced field.
@@ -87,7 +89,7 @@ pub fn make(
 ) -> Result<MapResult, MapError> {
     let plan = &moment.plan;
     let domain = &plan.domain;
-    let level = level(options.level, domain)?;
+    let level = level(options.level, domain, &moment.velocity)?;
     let geographic = is_geographic(&moment.velocity);
     let view = View::new(domain, geographic, options.projection, level, options.pixels).map_err(|why| {
         MapError::Usage(match options.projection {
@@ -98,7 +100,7 @@ pub fn make(
     let rate = Rate::fitting(&plan.time_unit, moment.taus.iter().copied().fold(0.0, f64::max));
     let directions = if options.both { vec![Direction::Forward, Direction::Backward] } else { vec![plan.map.direction] };
     let nodes = options.ridges.map(|_| options.ridge_grid.unwrap_or_else(|| ridge_nodes(&view)));
-    let mut notes = Vec::new();
+    let (mut notes, mut doubts) = (Vec::new(), Vec::<String>::new());
     let each = (view.size[0] * view.size[1] * options.sampling.seeds + nodes.map_or(0, |[x, y]| x * y)) as u64;
     let panels = moment.taus.len() * directions.len();
     let (mut done, total) = (0, each * panels as u64);
@@ -129,6 +131,7 @@ pub fn make(
             let flow = tracer.flow();
             let difference = flow.step_choice().map(|chosen| chosen.difference).filter(|d| d.is_finite());
             let steps = flow.steps();
+            doubts.extend(tracer.short_lived());
             notes.extend(tracer.note.take());
             traced.push(Traced { direction, tau, raster, steps, difference, ridges, found_by });
         }
@@ -139,6 +142,8 @@ pub fn make(
     let values: Vec<&[f32]> = traced.iter().map(|t| &t.raster.mean[..]).collect();
     let shown = options.range.unwrap_or_else(|| range(&values, options.both).map(|v| v * rate.factor));
     let scale = shown.map(|v| v / rate.factor);
+    doubts.extend(colourless(&traced, options, &rate, shown));
+    doubts.dedup();
     let found = options.arrows.then(|| arrows(&view, &moment.velocity, moment.time, 26.0));
     let figure = figure(moment, options, &view, &traced, &rate, shown, scale, found.as_ref());
     let record = MapRecord {
@@ -161,7 +166,7 @@ pub fn make(
     };
     let about = about(moment, rate, level);
     let lines = traced.into_iter().flat_map(|t| t.ridges).collect();
-    Ok(MapResult { figure, record, lines, about, notes })
+    Ok(MapResult { figure, record, lines, about, notes, doubts })
 }
 
 /// What files say of the ridges of a moment; `rate` is the unit of their FTLE.
@@ -173,24 +178,54 @@ pub(super) fn about(moment: &Moment, rate: Rate, level: f64) -> RidgesAbout {
         time_unit: moment.plan.time_unit.clone(),
         rate,
         is_geographic: is_geographic(&moment.velocity),
-        axes: axes(&moment.velocity).map(|(name, unit)| [name, unit]),
+        axes: moment.velocity.axes(),
         mapping: moment.plan.georeference.mapping.clone(),
-        // As in files of fields, which lie over these.
-        level: if moment.plan.domain.dimensions == 2 { 0.0 } else { level },
+        level: (moment.plan.domain.dimensions == 3).then_some(level),
     }
 }
 
+/// What the colours and lines of traced fields do not show. `shown`: the range of the colours, in the unit of the map.
+fn colourless(traced: &[Traced], options: &MapOptions, rate: &Rate, shown: [f64; 2]) -> Vec<String> {
+    let values = || traced.iter().flat_map(|t| &t.raster.mean).filter(|v| v.is_finite()).map(|v| f64::from(*v) * rate.factor);
+    let (least, most) = values().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), v| (least.min(v), most.max(v)));
+    let there = format!("the FTLE of the map is {} to {}", number(least), rate.words(most));
+    let mut said: Vec<String> = (options.contours.iter())
+        .filter(|level| **level <= least || **level >= most)
+        .map(|level| format!("--contour {level}: no line, since {there}"))
+        .collect();
+    let [low, high] = shown;
+    let within = values().filter(|v| (low..high).contains(v)).count();
+    match options.range {
+        Some(_) if within == 0 => said.push(format!("--range {low},{high}: one colour, since {there}")),
+        None if !options.both => {
+            let error = traced.iter().filter_map(|t| t.difference).reduce(f64::max);
+            let tau = traced.iter().map(|t| t.tau).fold(0.0, f64::max);
+            said.extend(uniform_ftle([least, most].map(|end| end / rate.factor), tau, error, "--range and --contour"));
+        }
+        _ => {}
+    }
+    said
+}
+
 /// Third coordinate of the seeds.
-fn level(given: Option<f64>, domain: &crate::field::Domain) -> Result<f64, MapError> {
+fn level(given: Option<f64>, domain: &crate::field::Domain, velocity: &VelocitySource) -> Result<f64, MapError> {
     let (low, high) = (domain.min[2], domain.max[2]);
     match given {
-        None => Ok((low + high) / 2.0),
+        None => Ok(middle_level(velocity).unwrap_or((low + high) / 2.0)),
         Some(level) if domain.dimensions == 2 => {
             Err(MapError::Usage(format!("--level {level}: the flow has two dimensions; accepted: a map without --level")))
         }
         Some(level) if (low..=high).contains(&level) => Ok(level),
         Some(level) => Err(MapError::Usage(format!("--level {level}: accepted: {low} to {high}, the third axis of the domain"))),
     }
+}
+
+/// Third coordinate of the level of gridded data that has as many levels below as above it, or between two of them.
+fn middle_level(velocity: &VelocitySource) -> Option<f64> {
+    let VelocitySource::Window(window) = velocity else { return None };
+    let levels = window.grid()?.axes.get(2)?.coordinates();
+    let (below, above) = (levels.get((levels.len() - 1) / 2)?, levels.get(levels.len() / 2)?);
+    Some((below + above) / 2.0)
 }
 
 /// Two nodes a pixel, along x and y: filaments of the FTLE are as narrow as pixels. Fewer if that passes a quarter of [`MOST_NODES`].
@@ -235,16 +270,6 @@ pub(super) fn nodes_in_cell(velocity: &VelocitySource, size: [usize; 2]) -> Opti
     let axes = &window.grid()?.axes;
     let nodes = |k: usize| Some((size[k] - 1) as f64 / axes.get(k)?.cells() as f64);
     Some([nodes(0)?, nodes(1)?])
-}
-
-/// Names and units of the coordinates.
-fn axes(velocity: &VelocitySource) -> [(String, String); 3] {
-    [0, 1, 2].map(|k| match velocity {
-        VelocitySource::Window(window) => {
-            window.grid().and_then(|g| g.axes.get(k)).map_or_else(Default::default, |a| (a.name().to_owned(), a.units().to_owned()))
-        }
-        VelocitySource::Analytic(..) => (["x", "y", "z"][k].into(), String::new()),
-    })
 }
 
 /// Title of the scene, else its files.
@@ -338,9 +363,9 @@ fn figure(
         })
         .collect();
     let tau = if moment.taus.len() == 1 { format!(", tau = {}", duration(moment.taus[0], &plan.time_unit)) } else { String::new() };
-    let names = axes(&moment.velocity);
+    let names = moment.velocity.axes();
     let level = if plan.domain.dimensions == 3 {
-        let [.., (name, unit)] = &names;
+        let [.., [name, unit]] = &names;
         let (unit, divisor) = axis_unit(unit, view.level.abs());
         let value = number(view.level / divisor);
         format!(", level {value} {unit} ({name})").replace("  ", " ")
@@ -364,7 +389,7 @@ fn figure(
     footer.push(format!("Pixels: mean of {} seeds{error}. Colours: {}.", options.sampling.seeds, colours.join(", ")));
     let speed = found.map(|arrows| {
         // Velocities on the sphere are metres, others are in the unit of the axes.
-        let length = if view.is_geographic { "m" } else { names[0].1.as_str() };
+        let length = if view.is_geographic { "m" } else { names[0][1].as_str() };
         let unit = if length.is_empty() || plan.time_unit.is_empty() { String::new() } else { format!(" {length}/{}", plan.time_unit) };
         format!("Longest arrow: {}{unit}.", number(arrows.fastest))
     });
@@ -384,7 +409,7 @@ fn figure(
         axes: if view.is_geographic {
             None
         } else {
-            let [x, y, _] = names;
+            let [x, y, _] = names.map(|[name, unit]| (name, unit));
             Some([x, y])
         },
         view: view.clone(),

@@ -62,10 +62,17 @@ impl Moment {
             setup.slides
         };
         let mut slide = None;
-        for _ in 0..=number {
+        let few = |there: u64| {
+            MapError::Usage(format!("--slide {number}: the source has fewer slides: {there}, counted from 0 (time.slides limits them)"))
+        };
+        // Before any work.
+        if let Some(there) = slides.expected().filter(|there| number >= *there) {
+            return Err(few(there));
+        }
+        for index in 0..=number {
             slide = slides.next_slide(&AtomicBool::new(false))?;
             if slide.is_none() {
-                return Err(MapError::Usage(format!("--slide {number}: the source has fewer slides")));
+                return Err(few(index));
             }
         }
         let slide = slide.ok_or_else(|| MapError::Usage("the source gave no slide".into()))?;

@@ -4,7 +4,7 @@ use super::lines::RidgesAbout;
 use super::make::structures;
 use super::surfaces::{SurfacePoint, Surfaces};
 use crate::flow::Direction;
-use crate::publish::vtk_xml::{Appended, Array, begin, text};
+use crate::publish::vtk_xml::{Appended, Array, begin, of_what, text};
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -25,7 +25,7 @@ impl SurfacesAbout {
     /// One line for people.
     fn line(&self) -> String {
         let RidgesAbout { title, source, when, .. } = &self.shared;
-        let of = [title.as_str(), source].into_iter().filter(|text| !text.is_empty()).collect::<Vec<_>>().join("; ");
+        let of = of_what(title, source);
         format!("{} ridge surfaces of the {} FTLE at {when}: {of}", structures(self.direction), self.direction.name())
     }
 }

@@ -75,6 +75,20 @@ impl<'a> Appended<'a> {
     }
 }
 
+/// Title of a scene and source of its velocity, as far as there are any.
+pub(crate) fn of_what(title: &str, source: &str) -> String {
+    [title, source].into_iter().filter(|text| !text.is_empty()).collect::<Vec<_>>().join("; ")
+}
+
+/// Names and units of what a file holds: coordinates of names and units, FTLE and times; without empty ones.
+pub(crate) fn unit_texts<'a>(axes: impl Iterator<Item = [&'a str; 2]>, time_unit: &str) -> impl Iterator<Item = (&'static str, String)> {
+    let axes = axes.filter(|[name, _]| !name.is_empty());
+    let axes = axes.map(|[name, unit]| if unit.is_empty() { name.to_owned() } else { format!("{name} [{unit}]") });
+    let rate = if time_unit.is_empty() { String::new() } else { format!("1/{time_unit}") };
+    let texts = [("coordinates", axes.collect::<Vec<_>>().join(", ")), ("ftle_unit", rate), ("time_unit", time_unit.to_owned())];
+    texts.into_iter().filter(|(_, text)| !text.is_empty())
+}
+
 /// Begins a file of a kind, such as `ImageData`, with a comment that says what it is.
 pub(crate) fn begin(out: &mut impl Write, kind: &str, about: &str) -> io::Result<()> {
     writeln!(out, "<?xml version=\"1.0\"?>\n<!-- {}, by ridgewatch {} -->", comment(about), env!("CARGO_PKG_VERSION"))?;

@@ -109,8 +109,12 @@ pub struct RunReport {
     pub frames: u64,
     /// Number of slides.
     pub slides: u64,
+    /// Slides that the source has, or the scene allows; `None` if that is not known.
+    pub slides_expected: Option<u64>,
     /// True if the caller stopped the run.
     pub interrupted: bool,
+    /// True if the run ended since its time was up ([`RunOptions::seconds`]).
+    pub time_is_up: bool,
     /// Seconds spent waiting for input.
     pub waited: f64,
     /// Seconds spent on frames and on adding available snapshots to the window.
@@ -344,7 +348,8 @@ pub fn run_on<B: Backend>(
 ) -> Result<RunReport, RunError> {
     let mut report = RunReport::default();
     match drive(backend, setup, options, sink, stop, &mut report) {
-        Ok(()) | Err(RunEnd::TimeIsUp) => {}
+        Ok(()) => {}
+        Err(RunEnd::TimeIsUp) => report.time_is_up = true,
         Err(RunEnd::Stopped) => report.interrupted = true,
         Err(RunEnd::Device(error)) => return Err(RunError::Device(Box::new(error))),
         Err(RunEnd::Failed(error)) => return Err(error),
@@ -364,7 +369,8 @@ fn drive<B: Backend>(
     let Setup { plan, mut slides, notes, decisions, earlier_race } = setup;
     report.decisions = decisions;
     let time = &plan.scene.time;
-    let planned = slides.expected().filter(|_| plan.scene.render.until.is_none());
+    report.slides_expected = slides.expected();
+    let planned = report.slides_expected.filter(|_| plan.scene.render.until.is_none());
     let frames = planned.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
     let threads = Threads::new(options.threads, &plan.scene)?;
@@ -980,7 +986,7 @@ impl Run<'_> {
         chosen: Option<StepChoice>,
         differences: Option<IntegrationDifferences>,
     ) -> Vec<String> {
-        let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
+        let mut warnings: Vec<String> = self.colourless(flow).into_iter().collect();
         if let Some(found) = &differences {
             warnings.extend(integration_warnings(found, &self.plan.map, flow.steps(), chosen.is_some()));
         }

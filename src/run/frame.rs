@@ -5,6 +5,7 @@ use super::budget::FrameCost;
 use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Learning, Run, Sink, fixed_steps};
 use super::decision::cpu_batch;
+use super::doubts::short_lived;
 use super::record::{DomainRecord, Frame};
 use super::setup::Plan;
 use super::slides::{Slide, Slides};
@@ -25,9 +26,6 @@ use crate::trust::{Gate, Strata};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
-
-/// Mean lifetime share of the particles below which a warning is given.
-const SHORT_LIVED: f64 = 0.75;
 
 /// Picture number of the first warm-up frame, larger than all other picture numbers.
 const WARMUP_PICTURES: u64 = 1 << 40;
@@ -397,12 +395,10 @@ impl Run<'_> {
         if work.audit.drawn > 0 && work.audit.points == 0 {
             warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
         }
-        let dying = work.audit.points > 0 && work.audit.mean_lifetime_share < SHORT_LIVED;
-        if dying && !std::mem::replace(&mut self.progress.has_warned_of_deaths, true) {
-            warnings.push(format!(
-                "particles live {:.2} % of tau on average: they meet land, leave the domain, or are too fast (unknown fill value or wrong unit?), and their FTLE covers only the path until then",
-                100.0 * work.audit.mean_lifetime_share
-            ));
+        if let Some(warning) = short_lived(work.audit.mean_lifetime_share).filter(|_| work.audit.points > 0)
+            && !std::mem::replace(&mut self.progress.has_warned_of_deaths, true)
+        {
+            warnings.push(warning);
         }
         FrameRecord {
             frame: self.progress.frame,

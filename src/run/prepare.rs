@@ -2,6 +2,7 @@
 
 use super::TransferRecord;
 use super::cycle::{MAX_RENDER_RESIDUALS, Run};
+use super::doubts::{beyond_colours, uniform_ftle};
 use super::slides::Slide;
 use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present};
@@ -24,11 +25,6 @@ const FRAMES_IN_BUFFER: usize = 4;
 const PROBE_STREAM: u64 = 1 << 62;
 /// First random stream of the points at which shorter durations are traced.
 const SHORTER_STREAM: u64 = 1 << 61;
-/// Range of the log-stretch below which the FTLE counts as uniform: neighbouring particles separate by factors that differ by at most 5 % over
-/// the domain.
-const UNIFORM: f64 = 0.05;
-/// Range of the FTLE, as a share of its magnitude, below which it counts as uniform.
-const UNIFORM_SHARE: f64 = 0.01;
 /// Work on a flow map: its steps may be chosen, and a device takes the window, and at first compiles kernels.
 pub(super) const FLOW_MAP: &str = "preparing the flow map";
 /// Picture number of the pilot.
@@ -139,22 +135,14 @@ impl Run<'_> {
         format!("colours from FTLE {low:.3e} to {high:.3e} {per} ({why}){extinction}")
     }
 
-    /// Warning for colours that are scaled to an FTLE that hardly varies; `None` otherwise.
-    pub(super) fn uniform(&self, tracer: &dyn Tracer) -> Option<String> {
+    /// Warning for colours that show no values, or are scaled to an FTLE that hardly varies; `None` otherwise.
+    pub(super) fn colourless(&self, tracer: &dyn Tracer) -> Option<String> {
         let given = self.plan.scene.transfer.clone().unwrap_or_default();
-        if given.low.is_some() && given.high.is_some() {
-            return None;
-        }
         let TransferRecord { low, high, .. } = self.transfer;
-        let range = (high - low) * tracer.tau();
-        let error = self.report.integration_difference.unwrap_or(0.0);
-        let size = low.abs().max(high.abs());
-        (range <= error.max(UNIFORM) || high - low <= UNIFORM_SHARE * size).then(|| {
-            format!(
-                "FTLE is uniform: colours have no range to scale to. The log-stretch (FTLE times tau) varies by {range:.1e} \
-                 over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
-            )
-        })
+        if given.low.is_some() && given.high.is_some() {
+            return self.threads.render().install(|| beyond_colours(tracer, &self.transfer, &self.plan.time_unit));
+        }
+        uniform_ftle([low, high], tracer.tau(), self.report.integration_difference, "transfer.low and transfer.high")
     }
 
     /// Warning for a window that starts outside the range of the network's input; `None` otherwise.

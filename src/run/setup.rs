@@ -220,6 +220,7 @@ impl Setup {
         if scene.training.resume.is_some() && (!scene.render.method.has_surrogate() || scene.surrogate.kind == Kind::Table) {
             notes.push("training.resume is ignored: methods reference and map, and tables, cannot resume from a checkpoint".to_owned());
         }
+        notes.extend(snapshots.as_ref().filter(|_| !scene.archive.steady).and_then(|source| below_interval(&**source, tau)));
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let georeference = snapshots.as_ref().map(|s| s.georeference()).unwrap_or_default();
         if scene.source.kind == SourceKind::Archive
@@ -247,6 +248,17 @@ impl Setup {
         let time_unit = unit.unwrap_or_default();
         Ok(Self { plan: Plan { scene, map, domain, source, time_unit, georeference, races }, slides, notes, decisions, earlier_race: None })
     }
+}
+
+/// Note on a tau that ends before the next snapshot: the number may have been meant in another unit.
+fn below_interval(source: &dyn SnapshotSource, tau: f64) -> Option<String> {
+    let unit = source.describe().time_unit;
+    let interval = source.times().windows(2).map(|pair| pair[1] - pair[0]).reduce(f64::min)?;
+    let with_unit = if unit == "s" { "; durations may have a unit, as \"5 days\"" } else { "" };
+    (tau < interval).then(|| {
+        let [tau, interval] = [tau, interval].map(|time| duration(time, &unit));
+        format!("tau is {tau}, less than the {interval} between snapshots, and shows hardly more than one of them{with_unit}")
+    })
 }
 
 /// Replaces `render.method = "default"` and `"auto"`: flows of two dimensions are drawn as maps, unless the scene sets what only volumes have. Returns

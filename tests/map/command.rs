@@ -162,10 +162,30 @@ fn both_directions_and_several_taus_share_a_picture() {
 }
 
 #[test]
+fn what_a_map_does_not_show_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let said = |arguments: &[&str]| {
+        let base = ["map", "--device", "cpu", "--width", "32", "--seeds", "2", "--out", "map.png"];
+        run(ridgewatch(base.iter().chain(arguments)).current_dir(folder.path())).success().stderr
+    };
+    let (gyre, saddle, data) = (config("double_gyre.toml"), config("saddle.toml"), ocean(folder.path()));
+    let told = said(&[&gyre, "--contour", "0.2,90", "--range", "20,30"]);
+    assert!(told.contains("--contour 90: no line, since the FTLE of the map is ") && !told.contains("--contour 0.2"), "{told}");
+    assert!(told.contains("--range 20,30: one colour, since the FTLE of the map is "), "{told}");
+    let told = said(&[&saddle]);
+    assert!(told.contains("FTLE is uniform") && told.contains("--range and --contour set the colours"), "{told}");
+    // Seconds, where days were meant.
+    let told = said(&[text(&data), "--tau", "2"]);
+    assert!(told.contains("tau is 2 s, less than the ") && told.contains("as \"5 days\""), "{told}");
+    let told = said(&[&config("abc.toml"), "--tau", "2"]);
+    assert!(told.contains("--level is not given: 3.14 is shown of 0 to 6.28"), "{told}");
+}
+
+#[test]
 fn refusals_name_what_is_wrong() {
     let folder = tempfile::tempdir().unwrap();
     let (gyre, abc, data) = (config("double_gyre.toml"), config("abc.toml"), ocean(folder.path()));
-    let cases: [(&[&str], &[&str]); 13] = [
+    let cases: [(&[&str], &[&str]); 15] = [
         (&[&gyre, "--seeds", "3"], &["--seeds", "even numbers from 2 to 4096"]),
         (&[&gyre, "--width", "8"], &["--width", "16"]),
         (&[&gyre, "--projection", "mercator"], &["--projection mercator", "accepted: plain"]),
@@ -174,7 +194,9 @@ fn refusals_name_what_is_wrong() {
         (&[&abc, "--level", "99"], &["--level 99", "accepted: 0 to 6.28"]),
         (&[&gyre, "--tau", "soon"], &["--tau", "30 days"]),
         (&[&gyre, "--range", "2,1"], &["--range", "LOW below HIGH"]),
-        (&[&gyre, "--slide", "99"], &["--slide 99", "fewer slides"]),
+        (&[&gyre, "--slide", "99"], &["--slide 99", "fewer slides: 10, counted from 0"]),
+        (&[&gyre, "--ridge-length", "4"], &["--ridge-length", "no ridge lines", "--ridges"]),
+        (&[&gyre, "--ridge-percentile", "80"], &["--ridge-percentile", "no ridge lines", "--ridges"]),
         (&[&gyre, "--out", "map.gif"], &["--out map.gif", ".png or .svg"]),
         (&[&gyre, "--width", "32", "--lines", "ridges.geojson"], &["--lines ridges.geojson", ".nc or .vtk"]),
         (&[&gyre, "--width", "32", "--lines", "ridges.shp"], &["--lines ridges.shp", ".geojson, .nc or .vtk"]),

@@ -189,6 +189,9 @@ fn vtk_files_hold_the_same_field() {
             }
             assert_eq!(vtk_array(document, appended, "direction"), [-1.0]);
             assert_eq!(vtk_array(document, appended, "TimeValue"), doubles(&file, "time")[..1]);
+            let codes = document.descendants().find(|n| n.attribute("Name") == Some("ftle_unit")).unwrap().text().unwrap();
+            let unit: Vec<u8> = codes.split(' ').map(|code| code.parse().unwrap()).collect();
+            assert_eq!(unit, b"1/s\0");
             let grid = document.root_element().first_element_child().unwrap();
             assert_eq!(grid.attribute("WholeExtent"), Some("0 12 0 8 0 2"));
             let height = 7000.0 * 4f64.ln();

@@ -88,7 +88,10 @@ fn a_field_has_the_units_of_its_source() {
         (&["--set", "archive.metric=index", "--set", "time.tau=2"], "snapshots", "1", "1"),
     ] {
         let (out, said) = succeeds(folder.path(), &[&["ftle", &file, "--grid", "9x5", "-o", "field.nc"][..], set].concat());
-        assert!(out.contains(&format!(" {unit}: tangent")) && said.contains("from that of twice as many"), "{out}{said}");
+        assert!(
+            out.contains(&format!(" {unit}")) && out.contains(&format!(" 1/{unit}\n")) && said.contains("from that of twice as many"),
+            "{out}{said}"
+        );
         let field = netcdf::open(folder.path().join("field.nc")).unwrap();
         let text = |attribute: Option<netcdf::Attribute>| match attribute.unwrap().value().unwrap() {
             netcdf::AttributeValue::Str(text) => text,
@@ -126,7 +129,12 @@ fn colours_are_told_and_what_has_none_is_warned_of() {
         let given = ["--set", "transfer.low=0", "--set", "transfer.high=1"];
         let (_, said) = drawn(folder.path(), &[&["render", source, "--out", "r.png", "--method", "reference"][..], set, &given].concat());
         assert!(said.contains(" to 1.000e0") && !said.contains("FTLE is uniform"), "as set: {said}");
+        assert!(!said.contains("show next to nothing"), "{said}");
     }
+    // Rates of a day, where those of a second are asked for.
+    let given = ["--set", "transfer.low=0.1", "--set", "transfer.high=2"];
+    let (_, said) = drawn(folder.path(), &[&["render", &file, "--out", "r.png"][..], &TWO_DAYS, &given].concat());
+    assert!(said.contains("transfer.low = 1.000e-1 and transfer.high = 2.000e0 /s show next to nothing"), "{said}");
 }
 
 #[test]

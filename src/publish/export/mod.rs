@@ -34,13 +34,17 @@ pub enum FieldFormat {
 }
 
 impl FieldFormat {
-    /// The format that a file's extension names; NetCDF for others.
-    pub fn of(path: &Path) -> Self {
-        match path.extension().and_then(|extension| extension.to_str()) {
-            Some("vti") => Self::VtkImage,
-            Some("vtr") => Self::VtkRectilinear,
-            Some("vts") => Self::VtkStructured,
-            _ => Self::NetCdf,
+    /// The format that a file's extension names.
+    ///
+    /// # Errors
+    /// Another extension; the text says what is accepted.
+    pub fn of(path: &Path) -> Result<Self, &'static str> {
+        match path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("nc" | "nc3" | "cdf") => Ok(Self::NetCdf),
+            Some("vti") => Ok(Self::VtkImage),
+            Some("vtr") => Ok(Self::VtkRectilinear),
+            Some("vts") => Ok(Self::VtkStructured),
+            _ => Err("accepted: names that end in .nc, .vti, .vtr or .vts, or any name with --format"),
         }
     }
 }
@@ -52,6 +56,8 @@ pub struct FieldFrame {
     pub grid: [usize; 3],
     domain: Domain,
     geometry: Geometry,
+    /// Names and units of the coordinates of the domain.
+    axes: [[String; 2]; 3],
     georeference: Georeference,
     direction: Direction,
     time_unit: String,
@@ -109,6 +115,7 @@ impl FieldFrame {
             grid,
             domain: plan.domain.clone(),
             geometry,
+            axes: slide.velocity.axes(),
             georeference: plan.georeference.clone(),
             direction: plan.map.direction,
             time_unit: plan.time_unit.clone(),
@@ -231,6 +238,14 @@ impl FieldExport {
         match &mut self.files {
             Files::Cf(file) => file.add(field).map_err(|e| failed(&self.path, e)),
             Files::Vtk(files) => files.add(field),
+        }
+    }
+
+    /// The first file of an earlier, longer series of the same name, which stays and belongs to no collection.
+    pub fn left_over(&self) -> Option<PathBuf> {
+        match &self.files {
+            Files::Cf(_) => None,
+            Files::Vtk(files) => files.left_over(),
         }
     }
 

@@ -3,7 +3,7 @@
 use super::{Field, FieldFrame, failed};
 use crate::field::Geometry;
 use crate::publish::PublishError;
-use crate::publish::vtk_xml::{Appended, Array, begin, escaped};
+use crate::publish::vtk_xml::{Appended, Array, begin, escaped, of_what, text, unit_texts};
 use std::fmt::Write as _;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
@@ -50,13 +50,7 @@ impl VtkFiles {
     }
 
     pub(super) fn add(&mut self, field: &Field) -> Result<(), PublishError> {
-        let path = if self.series {
-            let stem = self.path.file_stem().unwrap_or_default().to_string_lossy();
-            let extension = self.path.extension().map_or(self.kind.extension().into(), |e| e.to_string_lossy());
-            self.path.with_file_name(format!("{stem}_{:06}.{extension}", self.written.len()))
-        } else {
-            self.path.clone()
-        };
+        let path = if self.series { self.numbered(self.written.len()) } else { self.path.clone() };
         self.file(&path, field).map_err(|e| failed(&path, e))?;
         if self.series {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -74,6 +68,18 @@ impl VtkFiles {
 
     fn collection(&self) -> PathBuf {
         self.path.with_extension("pvd")
+    }
+
+    /// File of field `number` of a series.
+    fn numbered(&self, number: usize) -> PathBuf {
+        let stem = self.path.file_stem().unwrap_or_default().to_string_lossy();
+        let extension = self.path.extension().map_or(self.kind.extension().into(), |e| e.to_string_lossy());
+        self.path.with_file_name(format!("{stem}_{number:06}.{extension}"))
+    }
+
+    /// The next file of an earlier, longer series, which the new collection does not name.
+    pub(super) fn left_over(&self) -> Option<PathBuf> {
+        Some(self.numbered(self.written.len())).filter(|next| self.series && next.exists())
     }
 
     fn listed(&self) -> String {
@@ -129,8 +135,7 @@ impl VtkFiles {
         let extent = format!("0 {} 0 {} 0 {}", nx - 1, ny - 1, nz - 1);
         let spacing = |k: usize| axes[k].get(1).map_or(1.0, |second| second - axes[k][0]);
         let kind = self.kind.name();
-        let of = [&frame.title, &frame.source].into_iter().filter(|text| !text.is_empty()).cloned().collect::<Vec<_>>().join("; ");
-        begin(out, kind, &format!("{} FTLE of {of}", frame.direction.name()))?;
+        begin(out, kind, &format!("{} FTLE of {}", frame.direction.name(), of_what(&frame.title, &frame.source)))?;
         write!(out, "<{kind} WholeExtent=\"{extent}\"")?;
         if self.kind == VtkKind::Image {
             let [x, y, z] = [0, 1, 2].map(|k| axes[k][0]);
@@ -140,6 +145,11 @@ impl VtkFiles {
         let mut appended = Appended::default();
         writeln!(out, "<FieldData>")?;
         appended.declare(out, facts, true)?;
+        // Points of a sphere lie in space.
+        let in_metres = matches!((self.kind, frame.geometry), (VtkKind::Structured, Geometry::Sphere { .. }));
+        let axes = frame.axes.iter().map(|[name, unit]| [name.as_str(), unit]).take(frame.dimensions());
+        let axes = axes.filter(|_| !in_metres).chain(["x", "y", "z"].map(|name| [name, "m"]).into_iter().filter(|_| in_metres));
+        unit_texts(axes, &frame.time_unit).try_for_each(|(name, fact)| text(out, name, &fact))?;
         writeln!(out, "</FieldData>\n<Piece Extent=\"{extent}\">\n<PointData Scalars=\"ftle\">")?;
         appended.declare(out, points, false)?;
         writeln!(out, "</PointData>")?;
