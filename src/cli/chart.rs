@@ -1,6 +1,8 @@
 //! `ridgewatch chart`: speed against accuracy of a scene, and the pick; or an earlier chart, drawn anew.
 
-use super::common::{CHART, Common, Interrupted, RaceFile, Usage, beside_scene, device, located, print_json, print_text, scene, seconds};
+use super::common::{
+    CHART, Common, Interrupted, RaceFile, Usage, beside_scene, device, located, open, print_json, print_text, scene, seconds,
+};
 use super::messages;
 use super::signals::Stop;
 use anyhow::{Context, Result, bail};
@@ -90,7 +92,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let race = chart.pictures.as_ref().and_then(|pictures| pictures.race.clone()).filter(|_| stop.status() == 0);
     if let (Some(file), Some(race)) = (RaceFile::of(common, &scene, &options.paths, &device)?, race) {
-        file.write(race)?;
+        file.write(&open(&scene)?.plan, race)?;
     }
     match stop.status() {
         0 => Ok(()),

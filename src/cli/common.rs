@@ -8,7 +8,7 @@ use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::dashboard::DashboardError;
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{Race, RunError, Settings, Setup, why_steps};
+use ridgewatch::run::{Plan, Race, RunError, Settings, Setup, why_steps};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
@@ -145,15 +145,20 @@ impl RaceFile {
         Ok(Some(Self { path, of }))
     }
 
-    /// The race of an earlier run.
-    pub fn read(&self) -> Option<Race> {
+    /// The race of an earlier run over the same domain and tau.
+    pub fn read(&self, plan: &Plan) -> Option<Race> {
         let remembered: Remembered = serde_json::from_slice(&std::fs::read(&self.path).ok()?).ok()?;
-        Some(remembered.race).filter(|race| remembered.of == self.of && race.is_sound())
+        Some(remembered.race).filter(|race| remembered.of == self.over(plan) && race.is_sound())
+    }
+
+    /// What a race is of, with what the source decides: another simulation may be found at the same place.
+    fn over(&self, plan: &Plan) -> String {
+        format!("{} {:?} {}", self.of, plan.domain, plan.map.tau)
     }
 
     /// Keeps a race. A folder that cannot be written costs the next run its own race, and nothing else.
-    pub fn write(self, race: Race) -> Result<()> {
-        let text = serde_json::to_vec_pretty(&Remembered { of: self.of, race })?;
+    pub fn write(&self, plan: &Plan, race: Race) -> Result<()> {
+        let text = serde_json::to_vec_pretty(&Remembered { of: self.over(plan), race })?;
         if let Err(error) = ridgewatch::files::write_whole(&self.path, &text) {
             messages::note(format_args!("the race of methods is not remembered: {}: {error}", self.path.display()));
         }

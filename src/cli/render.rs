@@ -78,13 +78,13 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.set_by("time.warmup_frames", format!("--warmup {frames}"));
     }
     let device = device(common, &scene)?;
-    let earlier = RaceFile::of(common, &scene, &options.paths, &device)?.and_then(|race| race.read());
+    let race = RaceFile::of(common, &scene, &options.paths, &device)?;
     check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let run_options = RunOptions { verify_points: options.verify as usize, threads: common.threads, device, ..RunOptions::default() };
     let scene_text = scene.to_toml()?;
     let mut setup = open(&scene)?;
-    setup.earlier_race = earlier;
+    setup.earlier_race = race.and_then(|race| race.read(&setup.plan));
     if let Some(usage) = verifies_nothing(&setup, options.verify) {
         bail!(usage);
     }

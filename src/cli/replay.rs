@@ -30,12 +30,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     }
     let device = device(common, &scene)?;
     let race = RaceFile::of(common, &scene, &options.paths, &device)?;
-    let earlier = race.as_ref().and_then(RaceFile::read);
     let text = scene.to_toml()?;
     let chart = beside_scene(&options.paths, CHART);
-    Session { common, options: &options.run, scene, text, follows: None, chart, race }.run(|scene, _| {
-        let mut setup = open_by(scene, Setup::for_run)?;
-        setup.earlier_race = earlier;
-        Ok(Some(setup))
-    })
+    Session { common, options: &options.run, scene, text, follows: None, chart, race }
+        .run(|scene, _| open_by(scene, Setup::for_run).map(Some))
 }

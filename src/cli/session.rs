@@ -158,10 +158,11 @@ impl Session<'_> {
         if follows {
             watch();
         }
-        let Some(setup) = open(&scene, &stop.requested)? else {
+        let Some(mut setup) = open(&scene, &stop.requested)? else {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
+        setup.earlier_race = race.as_ref().and_then(|race| race.read(&setup.plan));
         for usage in [verifies_nothing(&setup, options.verify), films_nothing(&setup, options.movie_of)].into_iter().flatten() {
             if !follows {
                 bail!(usage);
@@ -229,10 +230,11 @@ impl Session<'_> {
             abandon: stop.abandoned.clone(),
         };
         let maps = SlideMaps::new(&setup.plan, &run_options.device).filter(|_| publish.maps);
+        let plan = setup.plan.clone();
         let (result, last, summary) = work(setup, &scene, &run_options, output, newest, maps, &stop.requested);
         let report = result?;
         if let (Some(file), Some(found)) = (race, &report.race) {
-            file.write(found.clone())?;
+            file.write(&plan, found.clone())?;
         }
         for warning in &report.warnings {
             messages::note(format_args!("after the last frame: {warning}"));
