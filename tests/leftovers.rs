@@ -43,7 +43,7 @@ fn a_ring_that_its_solver_and_its_killed_sidecar_left_is_listed_and_removed() {
     assert!(found.as_array().unwrap().iter().any(|one| one["ring"] == text(&ring.0)), "{found}");
     let removed = clean(&[text(&ring.0)]).stdout;
     assert!(!ring.0.exists() && removed.lines().count() == 3 && removed.starts_with("removed "), "{removed}");
-    assert_eq!(clean(&[text(&ring.0)]).stdout, "");
+    assert_eq!(clean(&[text(&ring.0)]).stdout, "nothing to remove\n");
     run(&mut ridgewatch(["clean", "--set", "a.b=1"])).refused(2, &["--set", "accepted: RING"]);
 }
 

@@ -1,8 +1,8 @@
 //! `ridgewatch clean`.
 
-use super::common::{Common, Usage, print_json, print_text};
+use super::common::{Common, print_json, print_text, refuse_settings};
 use super::messages;
-use anyhow::{Result, bail};
+use anyhow::Result;
 use ridgewatch_wire::{Cleaned, Leftover, WireError, clean, find_rings, leftovers, ring_from_environment};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -23,9 +23,7 @@ pub struct Options {
 
 /// Removes what no living process holds.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    if !common.overrides.is_empty() {
-        bail!(Usage("--set: clean has no scene; accepted: RING, --dry-run".into()));
-    }
+    refuse_settings(common, "clean", "RING, --dry-run")?;
     let mut rings = options.rings.clone();
     if rings.is_empty() {
         rings = find_rings(Path::new(SHARED_MEMORY));
@@ -49,6 +47,10 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         print_json(&results.iter().map(|(ring, found)| report(ring, found)).collect::<Vec<_>>())?;
     } else {
         results.iter().for_each(|(ring, found)| describe(ring, found, options.dry_run));
+        let is_empty = |found: &Cleaned| found.leftovers.is_empty() && found.living.is_empty() && !found.followed;
+        if failed.is_none() && results.iter().all(|(_, found)| is_empty(found)) {
+            print_text("nothing to remove");
+        }
     }
     failed.map_or(Ok(()), |error| Err(error.into()))
 }

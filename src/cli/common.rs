@@ -14,6 +14,7 @@ use ridgewatch::source::{SourceError, SourceKind, expand};
 use ridgewatch::steer::SteerError;
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 /// Options of every command.
 #[derive(Debug, clap::Args)]
@@ -247,6 +248,14 @@ pub fn refuse_live(scene: &SceneFile, what: &str) -> Result<()> {
     Ok(())
 }
 
+/// Refuses `--set` for a command without a scene. `accepted`: its own options.
+pub fn refuse_settings(common: &Common, command: &str, accepted: &str) -> Result<()> {
+    if common.overrides.is_empty() {
+        return Ok(());
+    }
+    bail!(Usage(format!("--set: {command} has no scene; accepted: {accepted}")))
+}
+
 /// Checks before the work that a file can be written.
 pub fn check_folder(out: &Path) -> Result<()> {
     // A rename would replace a pipe or a device.
@@ -299,9 +308,27 @@ pub fn print_json(value: &impl serde::Serialize) -> Result<()> {
     }
 }
 
-/// Prints the result for people. Ignores errors; a program reads the result of `--json`.
+/// The first error of [`print_text`].
+static LOST_TEXT: Mutex<Option<std::io::Error>> = Mutex::new(None);
+
+/// Prints the result for people. Work goes on if standard output does not take it; [`lost_text`] tells.
 pub fn print_text(text: impl std::fmt::Display) {
-    let _ = print(text);
+    if let Err(error) = print(text)
+        && error.kind() != std::io::ErrorKind::BrokenPipe
+    {
+        LOST_TEXT.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    }
+}
+
+/// Fails if a text could not be printed, as on a full disk; a closed pipe (`| head`) is none.
+///
+/// # Errors
+/// That of the first such text.
+pub fn lost_text() -> Result<()> {
+    match LOST_TEXT.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        Some(error) => Err(error).context("the result cannot be written to standard output"),
+        None => Ok(()),
+    }
 }
 
 fn print(text: impl std::fmt::Display) -> std::io::Result<()> {

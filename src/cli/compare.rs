@@ -1,6 +1,6 @@
 //! `ridgewatch compare`.
 
-use super::common::{Common, Usage, print_json, print_text};
+use super::common::{Common, Usage, print_json, print_text, refuse_settings};
 use anyhow::Result;
 use std::path::PathBuf;
 
@@ -18,6 +18,7 @@ pub struct Options {
 
 /// Compares.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
+    refuse_settings(common, "compare", "A, B, --tone-map")?;
     let tone_map = [options.tone_map[0], options.tone_map[1], options.tone_map[2]];
     let [contrast, brightness, gamma] = tone_map;
     if !(contrast.is_finite() && brightness.is_finite() && gamma.is_finite() && gamma > 0.0) {

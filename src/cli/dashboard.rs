@@ -1,6 +1,6 @@
 //! `ridgewatch dashboard`, and the dashboard beside a run.
 
-use super::common::{Common, Usage, print_json, print_text};
+use super::common::{Common, Usage, print_json, print_text, refuse_settings};
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::dashboard::{Dashboard, DashboardSettings, Token, host_name};
@@ -69,11 +69,7 @@ pub struct Options {
 
 /// Serves the page until a signal comes.
 pub fn run(common: &Common, options: Options) -> Result<()> {
-    if !common.overrides.is_empty() {
-        bail!(Usage(
-            "--set: dashboard has no scene; accepted: ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --run, --chart".into()
-        ));
-    }
+    refuse_settings(common, "dashboard", "ENDPOINT, --port, --bind, --allow-host, --token-file, --steer, --run, --chart")?;
     let Options { endpoint, port, reach, steer, run, chart } = options;
     if let Some(run) = run.as_deref().filter(|run| !run.is_dir()) {
         bail!(Usage(format!("--run {}: no such folder; accepted: the folder of a run (--out of replay and attach)", run.display())));

@@ -1,6 +1,6 @@
 //! `ridgewatch doctor`.
 
-use super::common::{Common, print_json, print_text};
+use super::common::{Common, print_json, print_text, refuse_settings};
 use anyhow::Result;
 use serde::Serialize;
 
@@ -30,6 +30,7 @@ struct Gpu {
 
 /// Prints what is found.
 pub fn run(common: &Common) -> Result<()> {
+    refuse_settings(common, "doctor", "--json")?;
     let gpu = gpu();
     let diagnosis = Diagnosis {
         version: env!("CARGO_PKG_VERSION"),

@@ -100,7 +100,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let common = arguments.common;
     // The pool of all work without its own pool, such as conversions and copies. 0 means one thread a core.
     rayon::ThreadPoolBuilder::new().num_threads(common.threads).build_global()?;
-    match arguments.command {
+    let done = match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
         Command::Attach(options) => attach::run(&common, options),
         Command::Dashboard(options) => dashboard::run(&common, options),
@@ -118,5 +118,6 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Inspect(options) => inspect::run(&common, &options),
         Command::Synthesize(options) => synthesize::run(&common, &options),
         Command::Doctor => doctor::run(&common),
-    }
+    };
+    done.and_then(|()| common::lost_text())
 }

@@ -1,9 +1,9 @@
 //! `ridgewatch relay`.
 
-use super::common::{Common, Usage, check_folder, print_json, ring_folder};
+use super::common::{Common, check_folder, print_json, refuse_settings, ring_folder};
 use super::process::Nice;
 use super::{messages, signals};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use ridgewatch_wire::message::{ConnectionFile, Key};
 use ridgewatch_wire::relay::{RelayCounts, serve};
 use std::net::{IpAddr, TcpListener};
@@ -38,9 +38,7 @@ fn out_of_reach(host: &str, address: IpAddr) -> Option<String> {
 
 /// Relays until a signal.
 pub fn run(common: &Common, options: Options) -> Result<()> {
-    if !common.overrides.is_empty() {
-        bail!(Usage("--set: relay has no scene; accepted: RING, --listen, --connection, --nice".into()));
-    }
+    refuse_settings(common, "relay", "RING, --listen, --connection, --nice")?;
     let ring = ring_folder(options.ring.as_deref())?;
     let listener = TcpListener::bind(&options.listen).with_context(|| format!("cannot listen at {}", options.listen))?;
     let (address, port) = (listener.local_addr()?.ip(), listener.local_addr()?.port());

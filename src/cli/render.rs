@@ -30,7 +30,7 @@ pub struct Options {
     #[arg(long, value_name = "TARGET")]
     until: Option<Target>,
     /// two_level: milliseconds of sampling per frame, instead of --spp.
-    #[arg(long, value_name = "MS")]
+    #[arg(long, value_name = "MS", conflicts_with = "spp")]
     budget: Option<f64>,
     /// Number of frames rendered and discarded first, with the scene's samples; they train the surrogate and tighten the majorants.
     /// Default: the scene's time.warmup_frames.
@@ -69,8 +69,14 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.render.samples = samples;
         scene.set_by("render.samples", format!("--spp {samples}"));
     }
-    scene.render.until = options.until.or(scene.render.until);
-    scene.render.budget = options.budget.or(scene.render.budget);
+    if let Some(until) = options.until {
+        scene.render.until = Some(until);
+        scene.set_by("render.until", "--until".to_owned());
+    }
+    if let Some(budget) = options.budget {
+        scene.render.budget = Some(budget);
+        scene.set_by("render.budget", format!("--budget {budget}"));
+    }
     scene.time.slides = Some(1);
     scene.time.frames_per_slide = 1;
     if let Some(frames) = options.warmup {

@@ -394,7 +394,12 @@ fn work(
 }
 
 fn print_report(report: &RunReport, last: Option<&FrameRecord>) {
-    let mut text = format!("{} frames of {} slides", report.frames, report.slides);
+    let counted = |count: u64, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
+    let mut text = format!("{} of {}", counted(report.frames, "frame"), counted(report.slides, "slide"));
+    if report.time_is_up {
+        let of = report.slides_expected.filter(|there| *there > report.slides).map(|there| format!(", which has {there} slides"));
+        text += &format!("; --seconds ended the run{}", of.unwrap_or_default());
+    }
     if let Some(last) = last {
         text += &format!(
             "; {} Runge-Kutta steps a path{}\nlast frame: {}",
@@ -491,7 +496,7 @@ pub fn line(record: &FrameRecord) -> String {
         );
     }
     if let Some(over) = record.tolerance_excess {
-        text += &format!(", OVER TOLERANCE by {over:.4}");
+        text += &format!(" (ABOVE trust.tolerance by {over:.4})");
     }
     text + &format!(", {:.2} s", record.seconds.total)
 }
@@ -510,7 +515,9 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
     let serde_json::Value::Object(map) = serde_json::json!({
         "frames": report.frames,
         "slides": report.slides,
+        "slides_expected": report.slides_expected,
         "interrupted": report.interrupted,
+        "time_is_up": report.time_is_up,
         "waited_seconds": report.waited,
         // Share of the time for input and work; saving and publishing are not counted.
         "waited_share": if report.waited > 0.0 { report.waited / (report.waited + report.worked) } else { 0.0 },

@@ -1,9 +1,11 @@
 //! `ridgewatch synthesize`: archives of the standard turbulence.
 
-use super::common::{Common, Usage, dimensions, print_json, print_text, word};
+use super::common::{Common, dimensions, print_json, print_text, refuse_settings, word};
 use super::messages;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
+use ridgewatch::setting;
 use ridgewatch::source::{SyntheticSettings, SyntheticShape};
+use std::collections::HashSet;
 use std::path::PathBuf;
 
 /// Options of `synthesize`.
@@ -37,9 +39,7 @@ fn shape(text: &str) -> Result<SyntheticShape, String> {
 
 /// Writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    if !common.overrides.is_empty() {
-        bail!(Usage("--set: synthesize has no scene; accepted: --nodes, --snapshots, --hard, --seed".into()));
-    }
+    refuse_settings(common, "synthesize", "--nodes, --snapshots, --hard, --seed")?;
     let mut settings = SyntheticSettings::new(options.shape);
     settings.nodes = options.nodes;
     settings.snapshots = options.snapshots;
@@ -49,12 +49,19 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
     let spinner = messages::spinner(format!("writing {} snapshots", settings.snapshots));
+    let names = |entries: std::fs::ReadDir| entries.flatten().map(|entry| entry.path()).collect::<HashSet<_>>();
+    let before = std::fs::read_dir(&options.out).map(names).unwrap_or_default();
     let files = ridgewatch::source::synthesize(&settings, &options.out)?;
     spinner.finish_and_clear();
     if common.json {
         return print_json(&files);
     }
-    messages::note(format_args!("{:?} turbulence of {:?} nodes, seed {}", settings.shape, settings.nodes, settings.seed));
+    let [x, y, z] = settings.nodes;
+    messages::note(format_args!("{} turbulence of {x}x{y}x{z} nodes, seed {}", setting::word(settings.shape), settings.seed));
+    let replaced = files.iter().filter(|file| before.contains(*file)).count();
+    if replaced > 0 {
+        messages::note(format_args!("{replaced} files of these names were there and are replaced"));
+    }
     print_text(format_args!("{} files in {}", files.len(), options.out.display()));
     Ok(())
 }

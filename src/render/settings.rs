@@ -348,11 +348,15 @@ impl RenderSettings {
         if let Some(budget) = settings.budget {
             require((0.1..=600_000.0).contains(&budget), "render.budget", budget, "milliseconds, 0.1 to 600000")?;
         }
-        let until = settings.until.is_none() || settings.method.accumulates();
-        require(until, "render.until", "given", "with render.method = \"map\", \"marched\" or \"two_level\"")?;
+        if let Some(until) = settings.until {
+            let accepted = "render.method = \"map\", \"marched\" or \"two_level\" with it";
+            require(settings.method.accumulates(), "render.until", until.to_string(), accepted)?;
+        }
         // A marched picture has a fixed number of samples.
-        let budget = settings.budget.is_none() || matches!(settings.method, Method::TwoLevel | Method::Auto | Method::Default);
-        require(budget, "render.budget", "given", "with render.method = \"two_level\"")?;
+        if let Some(budget) = settings.budget {
+            let fits = matches!(settings.method, Method::TwoLevel | Method::Auto | Method::Default);
+            require(fits, "render.budget", budget, "render.method = \"two_level\" with it")?;
+        }
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
         require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;

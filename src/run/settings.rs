@@ -192,6 +192,9 @@ impl TimeSettings {
                     refuse("time.tau", "has a unit", "a plain number: the time of a closed form has no unit")?;
                 }
             }
+            None if kind == SourceKind::Live => {
+                refuse("time.tau", "is missing", "a duration in the simulation's time (attach --tau TIME)")?
+            }
             None if kind != SourceKind::Archive => refuse("time.tau", "is missing", "a number above 0")?,
             None => {}
         }

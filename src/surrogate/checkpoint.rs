@@ -184,6 +184,7 @@ impl<'a> Checkpoint<'a> {
     pub(super) fn expect_note(&self, key: &str, expected: &str) -> Result<(), CheckpointError> {
         match self.text(key) {
             Some(found) if found == expected => Ok(()),
+            Some(found) if let Some((found, wanted)) = differences(found, expected) => Err(self.mismatch(found, wanted)),
             found => Err(self.mismatch(format!("{key} {}", found.unwrap_or("missing")), format!("{key} {expected}"))),
         }
     }
@@ -252,4 +253,18 @@ impl Opened {
         checkpoint.expect_note("checksum", &format!("{:016x}", checksum(words)))?;
         Ok(checkpoint)
     }
+}
+/// The entries in which two objects in JSON differ, as `name value`; `None` for texts of another kind.
+fn differences(found: &str, expected: &str) -> Option<(String, String)> {
+    let [Value::Object(found), Value::Object(expected)] = [found, expected].map(|text| serde_json::from_str(text).unwrap_or_default())
+    else {
+        return None;
+    };
+    let differ = |name: &&String| found.get(*name) != expected.get(*name);
+    let names: std::collections::BTreeSet<_> = found.keys().chain(expected.keys()).filter(differ).collect();
+    let listed = |of: &serde_json::Map<String, Value>| {
+        let entry = |name: &&String| format!("{name} {}", of.get(*name).map_or("none".into(), Value::to_string));
+        names.iter().map(entry).collect::<Vec<_>>().join(", ")
+    };
+    Some((listed(&found), listed(&expected)))
 }

@@ -76,9 +76,35 @@ fn a_result_that_cannot_be_written_is_an_error() {
     let said = String::from_utf8_lossy(&done.stderr);
     assert!(done.status.code() == Some(1) && said.contains("the result cannot be written to standard output: No space left"), "{said}");
     assert!(folder.path().join("run/summary.json").exists());
+    // What is for people is no less a result.
+    let mut command = program::ridgewatch(["doctor"]);
+    assert_eq!(command.stdout(full()).stderr(std::process::Stdio::null()).status().unwrap().code(), Some(1));
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     assert_eq!(program::ridgewatch(["doctor", "--json"]).stdout(writer).status().unwrap().code(), Some(0));
+}
+
+#[test]
+fn settings_without_a_scene_and_files_of_unknown_endings_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    refused(&["doctor", "--set", "render.width=9"], 2, &["--set: doctor has no scene"]);
+    refused(&["compare", "a.exr", "b.exr", "--set", "render.width=9"], 2, &["--set: compare has no scene"]);
+    refused(&["ftle", &scene, "--out", "field.png"], 2, &["--out field.png", ".nc, .vti, .vtr or .vts", "--format"]);
+    refused(&["render", &scene, "--spp", "4", "--budget", "10"], 2, &["--spp", "--budget"]);
+    refused(&["render", &scene, "--method", "reference", "--until", "40dB"], 2, &["--until", "40dB", "marched"]);
+}
+
+#[test]
+fn a_run_that_its_time_ended_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    let mut command = program::ridgewatch(["replay", &scene, "--seconds", "0.001", "--out", "run", "--set", "time.slides=4000"]);
+    let told = run(command.current_dir(folder.path())).success().stdout;
+    assert!(told.contains("; --seconds ended the run, which has 4000 slides"), "{told}");
+    let summary: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path().join("run/summary.json")).unwrap()).unwrap();
+    let of = |key: &str| summary["run"][key].clone();
+    assert_eq!((of("time_is_up"), of("slides_expected"), of("interrupted")), (true.into(), 4000.into(), false.into()));
 }
 
 /// However few threads the system grants, a run ends, with an error or without the help of those that are missing.

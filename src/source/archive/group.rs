@@ -73,7 +73,7 @@ pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<V
     }
     let mut found = Vec::new();
     for group in groups {
-        check_group(&group, held)?;
+        check_group(&group, held, settings)?;
         let own = moving.iter().filter(|part| same_times(&part.content.seconds, &group[0].content.seconds)).map(|part| part.path.clone());
         let own: Vec<PathBuf> = own.collect();
         if let (true, Some(part)) = (own.is_empty(), moving.first()) {
@@ -91,7 +91,7 @@ pub fn grouped(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Option<V
 }
 
 /// Refuses a group that lacks a component, or has one twice.
-fn check_group(group: &[Part], held: [bool; 3]) -> Result<(), SourceError> {
+fn check_group(group: &[Part], held: [bool; 3], settings: &ArchiveSettings) -> Result<(), SourceError> {
     for k in 0..3 {
         let with: Vec<&Part> = group.iter().filter(|part| part.content.components[k]).collect();
         let (first, name) = (&group[0], NAMES[k]);
@@ -105,7 +105,10 @@ fn check_group(group: &[Part], held: [bool; 3]) -> Result<(), SourceError> {
                         first.content.when
                     )
                 } else {
-                    format!("but no file holds {name}: name its files too")
+                    match [&settings.u, &settings.v, &settings.w][k] {
+                        Some(named) => format!("but no file holds {name}: none has the variable `{named}` that archive.{name} names"),
+                        None => format!("but no file holds {name}: name its files too"),
+                    }
                 };
                 return Err(SourceError::file(&first.path, format!("it holds {}, {who}", first.holds())));
             }
