@@ -5,6 +5,7 @@ use super::ftle::{CHARGED, FtlePanel, FtlePoint};
 use super::picture::{PictureCurve, PicturePanel};
 use super::scaling::{Axis, ScalingPanel};
 use super::verdict::size;
+use crate::source::duration;
 use image::{ImageFormat, RgbImage};
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
@@ -249,7 +250,8 @@ fn picture_size(panels: &[Panel]) -> (u32, u32) {
 
 fn title(chart: &Chart) -> String {
     let threads = if chart.threads == 1 { "thread" } else { "threads" };
-    format!("{} (tau {}{}) on {}, {} CPU {threads}", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads)
+    let name = if chart.scene.is_empty() { &chart.source } else { &chart.scene };
+    format!("{name} (tau {}) on {}, {} CPU {threads}", duration(chart.tau, &chart.time_unit), chart.device, chart.threads)
 }
 
 fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[Panel]) -> Result<(), DrawError> {
@@ -410,8 +412,9 @@ where
 
 /// A label of a tick on a logarithmic axis. Those of all tenths within a decade would run into each other: of 1, 2 and 5 only.
 fn tick(value: &f64) -> String {
-    let digit = (value / 10f64.powf((value.log10() + 1e-9).floor())).round() as i64;
-    if [1, 2, 5].contains(&digit) { power(value) } else { String::new() }
+    let digits = value / 10f64.powf((value.log10() + 1e-9).floor());
+    // Others in between would round to the same label.
+    if [1.0, 2.0, 5.0].iter().any(|digit| (digits - digit).abs() < 1e-3) { power(value) } else { String::new() }
 }
 
 /// A number on a logarithmic axis: 0.001 to 1000 in full, powers beyond.
