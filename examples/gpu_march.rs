@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::backend::cuda::{
-    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, PinnedFilm, RayCheck,
-    SnapshotStore, Tuning,
+    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Filled, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, PinnedFilm,
+    RayCheck, SnapshotStore, Tuning,
 };
 use ridgewatch::field::Window;
 use ridgewatch::field::turbulence::Turbulence;
@@ -106,14 +106,14 @@ fn main() {
     println!("\n| correction | combination | error and film |");
     println!("|---|---|---|");
     for (name, how) in [("left out", None), ("shrunk", Some(Combine::Shrink)), ("summed", Some(Combine::Sum))] {
-        let (mut finished, mut film) = (f32::INFINITY, PinnedFilm::new(&gpu, width, height));
+        let (mut finished, mut film) = (f32::INFINITY, PinnedFilm::new(&gpu, Filled::Combined, width, height));
         let combined = median(&gpu, || {
             let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
-            combine.combine(&input).map(drop)
+            combine.combine(&input, None).map(drop)
         });
         for _ in 0..5 {
             let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
-            let tiles = combine.combine(&input).unwrap().len();
+            let tiles = combine.combine(&input, None).unwrap().len();
             let began = gpu.mark().unwrap();
             combine.finish(&vec![[1e-4; 2]; tiles], 1e-5, &mut film, false).unwrap();
             finished = finished.min(gpu.milliseconds(&began, &gpu.mark().unwrap()).unwrap());

@@ -434,7 +434,7 @@ mod bench {
         router: DeviceQueryRouter,
         settled: Renderer,
         samples: u32,
-        reference: Film,
+        reference: Arc<Film>,
     }
 
     impl Pictures {
@@ -448,7 +448,7 @@ mod bench {
             scene.transfer = settled_colours(plan, exact, slide)?;
             let settled = Renderer::new(scene, &plan.domain, plan.map.tau)?;
             let (device, router) = (GpuRenderer::new(gpu)?, DeviceQueryRouter::new(gpu)?);
-            let mut pictures = Self { device, router, settled, samples: 1, reference: Film::default() };
+            let mut pictures = Self { device, router, settled, samples: 1, reference: Film::default().into() };
             let mut queries = 1;
             for frame in 0..6 {
                 let mut renderer = pictures.settled.clone();
@@ -468,7 +468,7 @@ mod bench {
             number: u64,
             tracer: &CudaTracer,
             surrogate: Option<&dyn DevicePredict>,
-        ) -> Result<(Film, RenderStats), DeviceError> {
+        ) -> Result<(Arc<Film>, RenderStats), DeviceError> {
             let everywhere = Gate::uniform(true);
             let mut answers = self.router.begin(FrameQueries {
                 tracer: tracer.device(),

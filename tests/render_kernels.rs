@@ -10,8 +10,7 @@ use ridgewatch::flow::{
 };
 use ridgewatch::render::rng::{FrameRandom, philox};
 use ridgewatch::render::{
-    Camera, CameraSettings, CellObservations, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, Transfer,
-    TransferSettings,
+    Camera, CameraSettings, CellObservations, Film, LightSettings, LogStretch, RenderSettings, Renderer, Scene, Transfer, TransferSettings,
 };
 use ridgewatch::surrogate::{Predict, Samples, Table};
 use ridgewatch::trust::{Audited, Gate, Residual, Strata, TrustMap, TrustSettings};
@@ -164,6 +163,14 @@ fn tracked(renderer: &mut Renderer, frame: u64, samples: std::ops::Range<u32>, p
     tracked_by("frame", &[], renderer, frame, samples, parts, ahead)
 }
 
+/// `PixelValue` of `kernels/rendering/film.cuh`.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct PixelValue {
+    rgba: [f32; 4],
+    rest: [f32; 6],
+}
+
 /// As [`tracked`], with the answers of `request`, whose own input is `setup`.
 fn tracked_by(
     request: &str,
@@ -185,7 +192,10 @@ fn tracked_by(
     let mut output = &output[..];
     let counts = read::<[u32; 6]>(&mut output, 1)[0].map(u64::from);
     let mut film = Film::new(37, 23);
-    film.write_pixels(0, &read::<PixelValue>(&mut output, pixels));
+    for (i, value) in read::<PixelValue>(&mut output, pixels).into_iter().enumerate() {
+        film.rgba[i] = value.rgba;
+        [film.ftle_mean[i], film.traced[i], film.variance[i], film.samples[i], film.missing[i], film.queries[i]] = value.rest;
+    }
     let seen = CellObservations { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
     assert!(output.is_empty());
     Tracked { counts, film, seen }

@@ -54,7 +54,12 @@ render_advance(const __grid_constant__ FrameScene scene, MajorantGrid grid, Watc
     add_counts(counts, control);
 }
 
-extern "C" __global__ void __launch_bounds__(256) render_film(Band band, Slots slots, PixelValue* __restrict__ film) {
+// The colours of all pixels of the band, then a plane for each of the other values, in the order of `Filled::Tracked` of films.rs.
+extern "C" __global__ void __launch_bounds__(256) render_film(Band band, Slots slots, float* __restrict__ film) {
     const uint32_t pixel = blockIdx.x * 256u + threadIdx.x;
-    if (pixel < band.pixels) film[pixel] = finished(band, slots, pixel);
+    if (pixel >= band.pixels) return;
+    const PixelValue value = finished(band, slots, pixel);
+    const float rest[6] = {value.ftle_mean, value.traced, value.missing, value.queries, value.samples, value.variance};
+    reinterpret_cast<float4*>(film)[pixel] = make_float4(value.rgba[0], value.rgba[1], value.rgba[2], value.rgba[3]);
+    for (uint32_t k = 0; k < 6u; ++k) film[(size_t)(4u + k) * band.pixels + pixel] = rest[k];
 }

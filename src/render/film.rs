@@ -65,38 +65,6 @@ impl Film {
         }
     }
 
-    /// Overwrites the pixels from index `first` on.
-    ///
-    /// # Panics
-    /// If there are more values than pixels.
-    pub fn write_pixels(&mut self, first: usize, values: &[PixelValue]) {
-        use rayon::prelude::*;
-        const CHUNK: usize = 1 << 15;
-        let range = first..first + values.len();
-        (
-            self.rgba[range.clone()].par_chunks_mut(CHUNK),
-            self.ftle_mean[range.clone()].par_chunks_mut(CHUNK),
-            self.traced[range.clone()].par_chunks_mut(CHUNK),
-            self.variance[range.clone()].par_chunks_mut(CHUNK),
-            self.samples[range.clone()].par_chunks_mut(CHUNK),
-            self.missing[range.clone()].par_chunks_mut(CHUNK),
-            self.queries[range].par_chunks_mut(CHUNK),
-            values.par_chunks(CHUNK),
-        )
-            .into_par_iter()
-            .for_each(|(rgba, ftle_mean, traced, variance, samples, missing, queries, values)| {
-                for (i, value) in values.iter().enumerate() {
-                    rgba[i] = value.rgba;
-                    ftle_mean[i] = value.ftle_mean;
-                    traced[i] = value.traced;
-                    variance[i] = value.variance;
-                    samples[i] = value.samples;
-                    missing[i] = value.missing;
-                    queries[i] = value.queries;
-                }
-            });
-    }
-
     /// Tone-mapped 8-bit RGB with `((c - 0.5) * contrast + brightness)^(1/gamma)`.
     pub fn tone_mapped(&self, [contrast, brightness, gamma]: [f64; 3]) -> Vec<u8> {
         let map = |c: f32| {
@@ -125,26 +93,6 @@ impl Film {
         }
         Ok(())
     }
-}
-
-/// One pixel of a picture; the fields are those of [`Film`], with the layout that kernels write.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct PixelValue {
-    /// R, G, B, alpha.
-    pub rgba: [f32; 4],
-    /// Mean FTLE.
-    pub ftle_mean: f32,
-    /// Traced share.
-    pub traced: f32,
-    /// Variance of the mean luminance.
-    pub variance: f32,
-    /// Samples.
-    pub samples: f32,
-    /// Share that saw missing values.
-    pub missing: f32,
-    /// Queries.
-    pub queries: f32,
 }
 
 /// Sums over the paths of a pixel, in f64.

@@ -32,7 +32,7 @@ pub mod rng;
 pub use albedo::{ALBEDO_PRESETS, albedo_preset};
 pub use camera::Camera;
 pub use error::RenderError;
-pub use film::{Film, PixelValue};
+pub use film::Film;
 pub use light::Light;
 pub use majorant::{CellObservations, MajorantGrid};
 pub use map_picture::{MAP_TONE, MapPicture, footprint, map_radiance, viridis};

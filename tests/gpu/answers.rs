@@ -126,6 +126,7 @@ impl Stage {
             })
             .unwrap();
         let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut routed, None, &NEVER).unwrap();
+        let film = Arc::unwrap_or_clone(film);
         let labels = routed.labels();
         assert!(routed.trace_seconds() >= 0.0 && routed.predict_seconds() > 0.0);
         let tally = Tally {

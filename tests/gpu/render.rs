@@ -11,6 +11,7 @@ use ridgewatch::flow::{
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
 use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
@@ -75,7 +76,8 @@ pub fn scene(width: usize, height: usize, point_light: bool) -> Scene {
 fn on_gpu(device: &mut GpuRenderer, gpu: &Gpu, renderer: &mut Renderer, frame: u64, samples: Range<u32>) -> (Film, RenderStats) {
     // What a kernel reads before it has written it would show.
     device.poison().unwrap();
-    device.render_samples(renderer, frame, samples, &mut ThroughHost(gpu), None, &NEVER).unwrap()
+    let (film, stats) = device.render_samples(renderer, frame, samples, &mut ThroughHost(gpu), None, &NEVER).unwrap();
+    (Arc::unwrap_or_clone(film), stats)
 }
 
 /// Films hold NaN where nothing was hit, so bits are compared.

@@ -23,8 +23,8 @@ pub use network::{
 };
 pub use rendering::{
     Audits, CombineInput, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DeviceNodes, DevicePredict,
-    DeviceQueryRouter, FrameQueries, GpuCombine, GpuFrames, GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, PairTiles, PinnedFilm,
-    RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll,
+    DeviceQueryRouter, Filled, FrameQueries, GpuCombine, GpuFrames, GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, PairTiles,
+    PinnedFilm, RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll,
 };
 pub use ridgewatch_base::DeviceError;
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};

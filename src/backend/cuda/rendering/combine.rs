@@ -4,13 +4,13 @@
 //! in L2 as far as possible. The film leaves the device as whole planes.
 
 use super::coupled::SUM_PLANES;
+use super::films::{Filled, PinnedFilm};
 use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
-use crate::cuda::driver::pinned::{Pinned, Registered, copy_to_host};
+use crate::cuda::driver::pinned::{Pinned, copy_to_host};
 use crate::cuda::layout::device_repr;
-use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
+use crate::cuda::{Buffer, DeviceError, Gpu, driver_error, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_render::Combine as Combination;
-use ridgewatch_render::Film;
 use ridgewatch_render::smooth::{TILE, TileError, TileSums};
 use std::sync::Arc;
 
@@ -111,59 +111,6 @@ pub struct CombineInput<'a> {
     pub lit: f32,
 }
 
-/// A film into which the device writes, pinned unless there are too many.
-pub struct PinnedFilm {
-    // Unpinned before it can be freed.
-    _pins: Vec<Registered>,
-    film: Arc<Film>,
-}
-
-impl PinnedFilm {
-    /// A film of this size that is not pinned, into which copies take longer.
-    pub fn unpinned(width: usize, height: usize) -> Self {
-        Self { _pins: Vec::new(), film: Arc::new(blank(width, height)) }
-    }
-
-    /// A film of this size. Memory that the driver does not pin is written all the same, but more slowly.
-    pub fn new(gpu: &Gpu, width: usize, height: usize) -> Self {
-        let mut film = blank(width, height);
-        // SAFETY: the pins are dropped before the film, whose planes nobody else can change while this holds it.
-        let pin = |values: &mut [f32]| unsafe { Registered::new(gpu.context(), values) };
-        let mut pins = vec![pin(film.rgba.as_flattened_mut())];
-        pins.extend(planes_of(&mut film).map(|values| pin(values)));
-        Self { _pins: pins.into_iter().filter_map(Result::ok).collect(), film: Arc::new(film) }
-    }
-
-    /// The film.
-    pub fn film(&self) -> &Arc<Film> {
-        &self.film
-    }
-
-    /// Returns true if nobody else holds the film, so that it can be filled again.
-    pub fn is_spare(&self) -> bool {
-        Arc::strong_count(&self.film) == 1
-    }
-}
-
-/// A film with the planes that the device writes.
-fn blank(width: usize, height: usize) -> Film {
-    /// Floats of a page, so that no two planes share one, which could be pinned once only.
-    const PAGE: usize = 1024;
-    fn plane<T: Copy + Default>(pixels: usize) -> Vec<T> {
-        let mut values = Vec::with_capacity(pixels + PAGE);
-        values.resize(pixels, T::default());
-        values
-    }
-    let mut film = Film { width, height, rgba: plane(width * height), ..Film::default() };
-    planes_of(&mut film).into_iter().for_each(|values| *values = plane(width * height));
-    film
-}
-
-/// Planes of a film that follow its colours in the memory of the device, in their order there.
-fn planes_of(film: &mut Film) -> [&mut Vec<f32>; 5] {
-    [&mut film.ftle_mean, &mut film.error, &mut film.missing, &mut film.samples, &mut film.traced]
-}
-
 /// Offsets of the planes of the working memory. The film overwrites planes that only the shrinkage needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Planes {
@@ -206,8 +153,8 @@ pub struct GpuCombine {
     tile_sums: Option<Buffer<f32>>,
     tile_errors: Option<Buffer<TileError>>,
     tiles_read: Option<Pinned<f32>>,
-    /// Argument of the picture that [`Self::finish`] completes.
-    begun: Option<CombineArgument>,
+    /// Argument of the picture that [`Self::finish`] completes, and whether its film is copied but for the error.
+    begun: Option<(CombineArgument, bool)>,
 }
 
 impl GpuCombine {
@@ -249,11 +196,11 @@ impl GpuCombine {
     }
 
     /// Adds the correction to the picture, and returns the sums of each tile, rows of tiles from the top. Waits for them. The film is then complete
-    /// but for its error.
+    /// but for its error. With `early` it is copied to a film meanwhile, which goes to [`Self::finish`]; `true`: that shows the same march already.
     ///
     /// # Errors
-    /// The picture has no rays or another size, or the device fails or lacks memory.
-    pub fn combine(&mut self, input: &CombineInput<'_>) -> Result<&[TileSums], DeviceError> {
+    /// The picture has no rays or another size, the film is held elsewhere or has another size, or the device fails or lacks memory.
+    pub fn combine(&mut self, input: &CombineInput<'_>, early: Option<(&mut PinnedFilm, bool)>) -> Result<&[TileSums], DeviceError> {
         self.begun = None;
         let [width, height] = input.size;
         let pixels = width * height;
@@ -318,8 +265,14 @@ impl GpuCombine {
         let read = pinned_room(&gpu, &mut self.tiles_read, count)?;
         // SAFETY: `tile_sums` holds `count` values.
         unsafe { read.copy_from(gpu.work(), tile_sums, count) }?;
-        gpu.synchronize()?;
-        self.begun = Some(argument);
+        let (is_read, is_early) = (gpu.mark()?, early.is_some());
+        if let Some((film, shows_march)) = early {
+            film.begins(&gpu);
+            // SAFETY: the kernel above has written the film; the copies are waited for by `finish`, or else when the film is dropped.
+            unsafe { copy_film(&gpu, &argument, film, |plane| plane != ERROR && !(shows_march && OF_MARCH.contains(&plane))) }?;
+        }
+        is_read.synchronize().map_err(driver_error("waiting for the device"))?;
+        self.begun = Some((argument, is_early));
         Ok(bytemuck::cast_slice(&read.values()[..count]))
     }
 
@@ -411,32 +364,59 @@ impl GpuCombine {
     /// # Errors
     /// Nothing was combined, `film` is held elsewhere or it or the tiles have another size, or the device fails.
     pub fn finish(&mut self, tiles: &[TileError], marched: f32, film: &mut PinnedFilm, shows_march: bool) -> Result<(), DeviceError> {
-        let (Some(argument), Some(tile_errors)) = (self.begun.take(), &mut self.tile_errors) else {
+        let (Some((argument, is_copied)), Some(tile_errors)) = (self.begun.take(), &mut self.tile_errors) else {
             return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
         };
         let size = [argument.width as usize, argument.height as usize];
-        let pixels = size[0] * size[1];
         let gpu = self.gpu.clone();
-        let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
-        let Some(film) = Arc::get_mut(&mut film.film) else { return refused("a film that is shown already") };
-        if [film.width, film.height] != size || tiles.len() != size[0].div_ceil(TILE) * size[1].div_ceil(TILE) {
-            return refused("a film of another size");
+        if tiles.len() != size[0].div_ceil(TILE) * size[1].div_ceil(TILE) {
+            return Err(DeviceError::Unsupported { what: "errors of another picture's tiles".into() });
         }
         tile_errors.write(tiles)?;
         let mut call = gpu.work().launch_builder(&self.errors);
         call.arg(&argument).arg(&marched);
         // SAFETY: the arguments of `combine_errors`; the film and the errors of the tiles are those of `combine`, for the same picture.
         unsafe { launch(&mut call, blocks(size[0].div_ceil(32), size[1].div_ceil(8))) }?;
-        let at = |plane: usize| argument.film + (plane * pixels * size_of::<f32>()) as u64;
-        // SAFETY: the planes hold the film; nothing reads or frees `film` before the copies have ended, below.
-        let copied = unsafe { copy_to_host(gpu.work(), at(0), film.rgba.as_flattened_mut()) }.and_then(|()| {
-            let mut planes = planes_of(film).into_iter().enumerate().filter(|(number, _)| !(shows_march && matches!(number, 0 | 2)));
-            // SAFETY: as above.
-            planes.try_for_each(|(number, values)| unsafe { copy_to_host(gpu.work(), at(4 + number), values) })
-        });
-        gpu.synchronize()?;
-        copied
+        film.begins(&gpu);
+        // SAFETY: the planes hold the film; the copies are waited for below, or else when the film is dropped.
+        unsafe { copy_film(&gpu, &argument, film, |plane| plane == ERROR || !(is_copied || shows_march && OF_MARCH.contains(&plane))) }?;
+        film.wait(&gpu)
     }
+}
+
+/// Planes of [`Filled::Combined`]: the error, and those that the march alone decides.
+const ERROR: usize = 1;
+const OF_MARCH: [usize; 2] = [0, 2];
+/// Stands for the colours, which come before the planes.
+const COLOURS: usize = usize::MAX;
+
+/// Enqueues copies of colours and planes to a film.
+///
+/// # Errors
+/// The film is held elsewhere or has another size, or a driver call fails.
+///
+/// # Safety
+/// The device holds the film of `argument`, and nothing reads or frees `film` before the copies have ended.
+unsafe fn copy_film(
+    gpu: &Gpu,
+    argument: &CombineArgument,
+    film: &mut PinnedFilm,
+    wanted: impl Fn(usize) -> bool,
+) -> Result<(), DeviceError> {
+    let size = [argument.width as usize, argument.height as usize];
+    let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
+    let Some(film) = film.film_mut() else { return refused("a film that is shown already") };
+    if [film.width, film.height] != size {
+        return refused("a film of another size");
+    }
+    let at = |plane: usize| argument.film + (plane * size[0] * size[1] * size_of::<f32>()) as u64;
+    if wanted(COLOURS) {
+        // SAFETY: guaranteed by the caller.
+        unsafe { copy_to_host(gpu.work(), at(0), film.rgba.as_flattened_mut()) }?;
+    }
+    let mut planes = Filled::Combined.planes(film).into_iter().enumerate().filter(|(plane, _)| wanted(*plane));
+    // SAFETY: as above.
+    planes.try_for_each(|(plane, values)| unsafe { copy_to_host(gpu.work(), at(4 + plane), values) })
 }
 
 /// A grid of blocks of 256 threads.

@@ -92,7 +92,7 @@ impl GpuFrames {
             let mut all = TraceAll(tracer.device());
             let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut all, progress, job.stop)?;
             let tally = Tally { trace_seconds: stats.evaluate_seconds, ..counts(&stats) };
-            return Ok(Rendered { film: film.into(), stats, tally, samples: CudaSamples::on_host(Samples::default()), error: None });
+            return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()), error: None });
         }
         let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
         if let (Some(smooth), Some(frozen), Some(predictor)) = (job.smooth, surrogate, &predictor) {
@@ -119,7 +119,7 @@ impl GpuFrames {
             ..counts(&stats)
         };
         labels.host = answers.labels();
-        Ok(Rendered { film: film.into(), stats, tally, samples: labels, error: None })
+        Ok(Rendered { film, stats, tally, samples: labels, error: None })
     }
 
     /// Renders a smooth frame.

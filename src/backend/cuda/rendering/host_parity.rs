@@ -304,7 +304,8 @@ fn checked_rays_agree() {
 #[ignore = "needs a GPU"]
 fn a_device_agrees() {
     use crate::cuda::{
-        CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, PinnedFilm, RayCheck,
+        CombineInput, DeviceNodes, DeviceTable, Filled, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, PinnedFilm,
+        RayCheck,
     };
     use ridgewatch_render::smooth::errors_of_tiles;
     let gpu = Gpu::open(0, &GpuSettings { poison: true, ..GpuSettings::default() }).unwrap();
@@ -328,9 +329,9 @@ fn a_device_agrees() {
             // Without pairs the film is the marched picture.
             let pairs = gpu.upload("pairs", &vec![0.0_f32; SUM_PLANES * pixels]).unwrap();
             let input = CombineInput { size: [37, 23], pairs: &pairs, march: &march, how: None, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
-            let tiles = combine.combine(&input).unwrap();
+            let tiles = combine.combine(&input, None).unwrap();
             assert!(tiles.len() == 6 && tiles.iter().all(|tile| tile.all.pixels == 0.0));
-            let mut film = PinnedFilm::new(&gpu, 37, 23);
+            let mut film = PinnedFilm::new(&gpu, Filled::Combined, 37, 23);
             combine.finish(&[[f32::NAN; 2]; 6], 0.0, &mut film, false).unwrap();
             let film = film.film();
             with_medium(renderer, &mut |medium| {
@@ -380,11 +381,11 @@ fn a_device_agrees() {
     {
         combine.poison().unwrap();
         let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
-        let tiles = combine.combine(&input).unwrap();
+        let tiles = combine.combine(&input, None).unwrap();
         let of_tiles = errors_of_tiles(tiles);
         assert!(of_tiles.iter().flatten().all(|error| *error > 0.0));
         let measured: f64 = tiles.iter().map(|tile| f64::from(tile.all.squared[0])).sum();
-        let mut film = PinnedFilm::new(&gpu, width, height);
+        let mut film = PinnedFilm::new(&gpu, Filled::Combined, width, height);
         combine.finish(&of_tiles, 2e-5, &mut film, false).unwrap();
         let film = film.film();
         if how.is_none() {

@@ -5,7 +5,6 @@
 use crate::cuda::driver::pinned::Pinned;
 use crate::cuda::{Buffer, DeviceError, Gpu};
 use cudarc::driver::DeviceRepr;
-use ridgewatch_render::PixelValue;
 
 /// Target number of slots: enough to fill the device and to make sorting worthwhile.
 const WANTED_SLOTS: u64 = 1 << 21;
@@ -15,6 +14,8 @@ const MAX_SLOTS: u64 = 1 << 22;
 const MIN_QUEUE: u64 = 1 << 23;
 /// Number of sums per pixel (`PIXEL_SUM_FIELDS` of the kernels).
 const SUM_FIELDS: u64 = 11;
+/// Floats per pixel of the film: four of its colour, and its other planes.
+const FILM_FLOATS: u64 = 10;
 
 /// Sizes of a frame's arrays on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -110,7 +111,7 @@ impl Layout {
             hits: [take(queue, 16), take(queue, 16)],
             log_stretch: take(queue, 4),
             by: take(queue, 1),
-            film: take(u64::from(plan.band), size_of::<PixelValue>() as u64),
+            film: take(u64::from(plan.band), FILM_FLOATS * 4),
             majorants: take(cells, 4),
             may_miss: take(cells, 1),
             watch: take(3 * cells, 4),
@@ -142,7 +143,6 @@ pub(in crate::cuda) struct Memory {
     pub(in crate::cuda) block: Buffer<u8>,
     pub(in crate::cuda) control: Pinned<Control>,
     pub(in crate::cuda) watch: Pinned<u32>,
-    pub(in crate::cuda) film: Pinned<PixelValue>,
 }
 
 impl Memory {
@@ -158,7 +158,6 @@ impl Memory {
             block: gpu.alloc("rendering", layout.end as usize)?,
             control: Pinned::new(gpu.context(), 1)?,
             watch: Pinned::new(gpu.context(), 3 * plan.cells as usize)?,
-            film: Pinned::new(gpu.context(), plan.band as usize)?,
         })
     }
 

@@ -4,6 +4,7 @@ mod audit;
 mod bricks;
 mod combine;
 mod coupled;
+mod films;
 mod frames;
 #[cfg(test)]
 mod host_parity;
@@ -16,8 +17,9 @@ mod router;
 mod smooth;
 
 pub use audit::Audits;
-pub use combine::{CombineInput, GpuCombine, PinnedFilm};
+pub use combine::{CombineInput, GpuCombine};
 pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
+pub use films::{Filled, PinnedFilm};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
 pub use march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};

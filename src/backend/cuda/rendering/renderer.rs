@@ -9,6 +9,8 @@
 //! [`Renderer::render`] up to rounding if the evaluated values are equal: random numbers and states are the same, and the order of the sums depends
 //! only on the numbers of pixels and samples. Between frames, the host updates the majorants from the observations of the device.
 
+use crate::cuda::driver::pinned::copy_to_host;
+use crate::cuda::rendering::films::{Filled, Films, PinnedFilm};
 use crate::cuda::rendering::memory::{Control, Memory, Plan};
 use crate::cuda::{DeviceError, DeviceLogStretch, Gpu, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
@@ -122,6 +124,8 @@ pub struct GpuRenderer {
     advance: CudaFunction,
     film: CudaFunction,
     memory: Option<Memory>,
+    /// Films show what [`constants`] tells.
+    films: Films,
     /// Limit on the device memory of rendering, bytes.
     allowed: u64,
     look_ahead: LookAhead,
@@ -153,6 +157,7 @@ impl GpuRenderer {
             allowed: gpu.memory_left() / MEMORY_SHARE,
             gpu: gpu.clone(),
             memory: None,
+            films: Films::new(Filled::Tracked),
             look_ahead: LOOK_AHEAD,
             timeline: Timeline::default(),
             over_budget: 0,
@@ -202,7 +207,7 @@ impl GpuRenderer {
         answers: &mut dyn DeviceLogStretch,
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), DeviceError> {
+    ) -> Result<(Arc<Film>, RenderStats), DeviceError> {
         let settings = &renderer.scene().settings;
         let (width, height) = (settings.width, settings.height);
         let pixels = width * height;
@@ -214,7 +219,7 @@ impl GpuRenderer {
         let allowed = self.allowed.min(own + self.gpu.memory_left() / MEMORY_SHARE);
         let plan = Plan::new(pixels, count, setup.majorants.len(), allowed);
         self.reserve(plan)?.begin_frame(setup.majorants, setup.may_be_missing)?;
-        let parameters = setup.parameters;
+        let (parameters, shows) = (setup.parameters, constants(count, setup.may_be_missing));
         let mut stats = RenderStats::default();
         let band = |first: usize| BandArgument {
             first_pixel: first as u32,
@@ -230,24 +235,15 @@ impl GpuRenderer {
                 progress((done as f64 / paths) as f32);
             }
         };
-        // The film is allocated while the device works on the first band.
-        let mut film = None;
-        let tracked = rayon::in_place_scope(|scope| {
-            scope.spawn(|_| film = Some(Film::resident(width, height)));
-            self.band(&parameters, band(0), answers, &report, stop)
-        });
-        let mut film = film.unwrap_or_else(|| Film::new(width, height));
-        let mut stopped = tracked?;
+        let mut film = self.films.spare(&self.gpu, width, height);
         for first in (0..pixels).step_by(plan.band as usize) {
-            if first > 0 {
-                stopped = self.band(&parameters, band(first), answers, &report, stop)?;
-            }
-            if stopped {
+            if self.band(&parameters, band(first), answers, &report, stop)? {
                 stats.stopped = true;
                 break;
             }
-            self.read_film(&parameters, band(first), &mut film)?;
+            self.read_film(&parameters, band(first), &mut film, shows)?;
         }
+        film.shows = shows;
         let seen = self.end_frame(&mut stats)?;
         answers.end()?;
         // The majorant grid has not changed, since the renderer is borrowed during the frame.
@@ -259,6 +255,8 @@ impl GpuRenderer {
         stats.walk_seconds = timeline.start + timeline.advance + timeline.film;
         stats.evaluate_seconds = timeline.answer;
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
+        // The kept ones have pixels of earlier frames.
+        let film = if stats.stopped { Film::new(width, height).into() } else { self.films.put(film) };
         Ok((film, stats))
     }
 
@@ -337,9 +335,16 @@ impl GpuRenderer {
         Ok(false)
     }
 
-    /// Computes the pixel values of a band from its sums and copies them to the film.
-    fn read_film(&mut self, parameters: &FrameParameters, band: BandArgument, film: &mut Film) -> Result<(), DeviceError> {
+    /// Computes the pixel values of a band from its sums and copies them to the film, without the planes that it shows already ([`constants`]).
+    fn read_film(
+        &mut self,
+        parameters: &FrameParameters,
+        band: BandArgument,
+        film: &mut PinnedFilm,
+        shows: u64,
+    ) -> Result<(), DeviceError> {
         let (gpu, kernel) = (self.gpu.clone(), self.film.clone());
+        let is_shown = film.shows == shows;
         let memory = self.memory()?;
         let wave = memory.wave(*parameters, band);
         let began = gpu.mark()?;
@@ -348,11 +353,28 @@ impl GpuRenderer {
         call.arg(&wave.band).arg(&wave.slots).arg(&out);
         // SAFETY: the arguments of `render_film`; every slot of the band has written its sums.
         unsafe { launch(&mut call, threads(band.pixels as usize, 256)) }?;
-        // SAFETY: the kernel writes `band.pixels` pixels, and `film` holds a band.
-        unsafe { memory.film.copy_from(gpu.work(), out, band.pixels as usize) }?;
+        let pixels = band.pixels as usize;
+        let range = band.first_pixel as usize..band.first_pixel as usize + pixels;
+        let at = |plane: usize| out + (plane * pixels * size_of::<f32>()) as u64;
+        let one_sample = band.samples == 1;
+        let is_constant = |plane: usize| match plane {
+            MISSING => shows & NOTHING_MISSING != 0,
+            SAMPLES => true,
+            VARIANCE => one_sample,
+            _ => false,
+        };
+        film.begins(&gpu);
+        let Some(picture) = film.film_mut() else { return Err(DeviceError::Unsupported { what: "a film that is shown already".into() }) };
+        // SAFETY: the kernel writes `pixels` pixels; the copies are waited for below, or else when the film is dropped.
+        unsafe { copy_to_host(gpu.work(), at(0), picture.rgba[range.clone()].as_flattened_mut()) }?;
+        for (plane, values) in Filled::Tracked.planes(picture).into_iter().enumerate() {
+            if !(is_shown && is_constant(plane)) {
+                // SAFETY: as above.
+                unsafe { copy_to_host(gpu.work(), at(4 + plane), &mut values[range.clone()]) }?;
+            }
+        }
         let ended = gpu.mark()?;
-        gpu.synchronize()?;
-        film.write_pixels(band.first_pixel as usize, &memory.film.values()[..band.pixels as usize]);
+        film.wait(&gpu)?;
         self.timeline.film += f64::from(gpu.milliseconds(&began, &ended)?) * 1e-3;
         Ok(())
     }
@@ -364,6 +386,18 @@ impl GpuRenderer {
         [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, self.over_budget] = control.totals;
         Ok(seen)
     }
+}
+
+/// Planes of [`Filled::Tracked`] that are the same from frame to frame: where no cell may lack a velocity, with equal numbers of samples, and with one.
+const MISSING: usize = 2;
+const SAMPLES: usize = 4;
+const VARIANCE: usize = 5;
+/// Bit of [`constants`].
+const NOTHING_MISSING: u64 = 1;
+
+/// What decides these planes, as a number above 0.
+fn constants(samples: u32, may_be_missing: &[bool]) -> u64 {
+    u64::from(samples) << 1 | if may_be_missing.contains(&true) { 0 } else { NOTHING_MISSING }
 }
 
 impl Timeline {

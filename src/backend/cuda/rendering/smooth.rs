@@ -2,8 +2,9 @@
 //! result. The algorithm and its reference are in [`ridgewatch_render::smooth`]; how finely to march and where to sample is decided there as well.
 
 use super::bricks::{DeviceBricks, Wanted};
-use super::combine::{CombineInput, GpuCombine, PinnedFilm};
+use super::combine::{CombineInput, GpuCombine};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
+use super::films::{Filled, Films};
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 use super::predictor::Predictor;
 use super::router::DeviceLogStretch;
@@ -31,8 +32,6 @@ const LIGHT_SHARE: u64 = 8;
 const MIN_MARCH_SECONDS: f64 = 0.005;
 /// Pairs of a tile in one call of the tracker.
 const MAX_PAIRS: usize = 256;
-/// Films that are kept to be filled again: one on its way, and those that wait for a slow disk.
-const FILMS: usize = 6;
 
 /// One picture that accumulates on the GPU. It reuses kernels and memory from picture to picture.
 pub(in crate::cuda) struct GpuSmooth {
@@ -54,14 +53,8 @@ pub(in crate::cuda) struct GpuSmooth {
     pairs: u64,
     /// Marches so far, of all pictures.
     marches: u64,
-    /// The latest films. Those that nobody holds any more are filled again, since it takes longer to map and pin memory than to fill it.
-    films: Vec<KeptFilm>,
-}
-
-/// A film and the number of the march that it shows.
-struct KeptFilm {
-    film: PinnedFilm,
-    march: u64,
+    /// Films show the number of their march.
+    films: Films,
 }
 
 /// One round of refinement.
@@ -112,7 +105,7 @@ impl GpuSmooth {
             allocation: Allocation::default(),
             pairs: 0,
             marches: 0,
-            films: Vec::new(),
+            films: Films::new(Filled::Combined),
         })
     }
 
@@ -198,7 +191,7 @@ impl GpuSmooth {
             (_, false) => Some(Combine::Shrink),
         };
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
-        let mut film = self.spare_film(width, height);
+        let mut film = self.films.spare(&self.gpu, width, height);
         let (error, of_tiles) = loop {
             if stats.stopped || round.stop.load(Ordering::Relaxed) {
                 self.shows = None;
@@ -206,7 +199,10 @@ impl GpuSmooth {
             }
             let Some(pairs) = &self.sums else { return Err(unsupported("a picture without sums")) };
             let input = CombineInput { size: [width, height], pairs, march: &self.march, how, tone_map, lit: LIT };
-            let tiles = self.combine.combine(&input)?;
+            // The host works on the error meanwhile.
+            let shows_march = film.shows == self.marches;
+            let early = (!self.control.is_due()).then_some((&mut film, shows_march));
+            let tiles = self.combine.combine(&input, early)?;
             let error = PictureError::of(tiles, &self.control.errors(), samples_per_pixel, self.control.rays);
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
@@ -223,26 +219,12 @@ impl GpuSmooth {
             }
             marching += self.march(round, renderer, &parameters)?;
         };
-        let shows_march = film.march == self.marches;
-        self.combine.finish(&of_tiles, self.control.error() as f32, &mut film.film, shows_march)?;
-        film.march = self.marches;
-        let shown = film.film.film().clone();
-        if self.films.len() < FILMS {
-            self.films.push(film);
-        }
+        let shows_march = film.shows == self.marches;
+        self.combine.finish(&of_tiles, self.control.error() as f32, &mut film, shows_march)?;
+        film.shows = self.marches;
+        let shown = self.films.put(film);
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
         Ok(Some((shown, stats, error)))
-    }
-
-    /// A film of this size that nobody else holds.
-    fn spare_film(&mut self, width: usize, height: usize) -> KeptFilm {
-        self.films.retain(|kept| [kept.film.film().width, kept.film.film().height] == [width, height]);
-        if let Some(spare) = self.films.iter().position(|kept| kept.film.is_spare()) {
-            return self.films.swap_remove(spare);
-        }
-        // Pinning takes longer than a copy into memory that is not.
-        let is_kept = self.films.len() < FILMS;
-        KeptFilm { film: if is_kept { PinnedFilm::new(&self.gpu, width, height) } else { PinnedFilm::unpinned(width, height) }, march: 0 }
     }
 
     /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
