@@ -91,8 +91,9 @@ network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ 
 extern "C" __global__ void __launch_bounds__(256)
 network_usable(const Float4* __restrict__ samples, uint32_t n, uint32_t* __restrict__ count) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
-    const uint32_t usable = __ballot_sync(0xffffffffu, i < n && is_usable(load_sample(samples + (i < n ? i : 0u) * size_t(SAMPLE_FLOAT4S))));
-    if ((threadIdx.x & 31u) == 0u && usable) atomicAdd(count, uint32_t(__popc(usable)));
+    // One sum a block: a sum of each warp would wait for the others at the one counter.
+    const int usable = __syncthreads_count(i < n && is_usable(load_sample(samples + (i < n ? i : 0u) * size_t(SAMPLE_FLOAT4S))));
+    if (threadIdx.x == 0u && usable) atomicAdd(count, uint32_t(usable));
 }
 
 // The penalty on the difference of a batch's means needs all outputs before any gradient. `network_drawn` writes the batch's points (`points`

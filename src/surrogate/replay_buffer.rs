@@ -116,14 +116,15 @@ impl ReplayBuffer {
             self.epoch = fresh_stamp();
         }
         self.pushed += samples.len() as u64;
-        let first = samples.len().saturating_sub(self.capacity);
-        for index in first..samples.len() {
-            if self.fresh.len() < self.capacity {
-                append(&mut self.fresh, samples, index, self.now);
-            } else {
-                overwrite(&mut self.fresh, self.next, samples, index, self.now);
-                self.next = (self.next + 1) % self.capacity;
-            }
+        let mut first = samples.len().saturating_sub(self.capacity);
+        let room = (self.capacity - self.fresh.len()).min(samples.len() - first);
+        append(&mut self.fresh, samples, first..first + room, self.now);
+        first += room;
+        while first < samples.len() {
+            let part = (samples.len() - first).min(self.capacity - self.next);
+            overwrite(&mut self.fresh, self.next, samples, first..first + part, self.now);
+            self.next = (self.next + part) % self.capacity;
+            first += part;
         }
         let room = self.capacity - self.fresh.len();
         self.stale.points.truncate(room);
@@ -156,9 +157,7 @@ impl ReplayBuffer {
             return false;
         }
         let room = (self.capacity - self.fresh.len()).min(stale.len());
-        for index in 0..room {
-            append(&mut self.fresh, &stale, index, None);
-        }
+        append(&mut self.fresh, &stale, 0..room, None);
         self.epoch = fresh_stamp();
         true
     }
@@ -168,25 +167,38 @@ fn shape(samples: &Samples) -> [bool; 2] {
     [samples.arrival.len() == samples.len(), samples.jacobian.len() == samples.len()]
 }
 
-fn append(to: &mut Samples, from: &Samples, index: usize, now: Option<[f32; 2]>) {
-    to.points.push(from.points[index]);
-    to.log_stretch.push(from.log_stretch.get(index).copied().unwrap_or(f32::NAN));
-    to.arrival.extend(from.arrival.get(index));
-    to.jacobian.extend(from.jacobian.get(index));
-    to.times.extend(from.times.get(index).copied().or(now));
+/// Log-stretches of samples that have some; NaN for others, whose arrivals are their labels.
+fn log_stretches(of: &Samples, range: Range<usize>) -> impl Iterator<Item = f32> {
+    range.map(|index| of.log_stretch.get(index).copied().unwrap_or(f32::NAN))
 }
 
-fn overwrite(to: &mut Samples, at: usize, from: &Samples, index: usize, now: Option<[f32; 2]>) {
-    to.points[at] = from.points[index];
-    to.log_stretch[at] = from.log_stretch.get(index).copied().unwrap_or(f32::NAN);
-    if let (Some(to), Some(&from)) = (to.arrival.get_mut(at), from.arrival.get(index)) {
-        *to = from;
+fn append(to: &mut Samples, from: &Samples, range: Range<usize>, now: Option<[f32; 2]>) {
+    to.points.extend_from_slice(&from.points[range.clone()]);
+    to.log_stretch.extend(log_stretches(from, range.clone()));
+    to.arrival.extend_from_slice(from.arrival.get(range.clone()).unwrap_or_default());
+    to.jacobian.extend_from_slice(from.jacobian.get(range.clone()).unwrap_or_default());
+    match (from.times.get(range.clone()), now) {
+        (Some(times), _) if !from.times.is_empty() => to.times.extend_from_slice(times),
+        (_, Some(now)) => to.times.extend(std::iter::repeat_n(now, range.len())),
+        _ => {}
     }
-    if let (Some(to), Some(&from)) = (to.jacobian.get_mut(at), from.jacobian.get(index)) {
-        *to = from;
+}
+
+fn overwrite(to: &mut Samples, at: usize, from: &Samples, range: Range<usize>, now: Option<[f32; 2]>) {
+    /// Nothing where one of them has none.
+    fn put<T: Copy>(to: &mut [T], into: &Range<usize>, from: &[T], range: &Range<usize>) {
+        if let (Some(to), Some(from)) = (to.get_mut(into.clone()), from.get(range.clone())) {
+            to.copy_from_slice(from);
+        }
     }
-    if let (Some(to), Some(from)) = (to.times.get_mut(at), from.times.get(index).copied().or(now)) {
-        *to = from;
+    let into = at..at + range.len();
+    put(&mut to.points, &into, &from.points, &range);
+    to.log_stretch[into.clone()].iter_mut().zip(log_stretches(from, range.clone())).for_each(|(to, from)| *to = from);
+    put(&mut to.arrival, &into, &from.arrival, &range);
+    put(&mut to.jacobian, &into, &from.jacobian, &range);
+    put(&mut to.times, &into, &from.times, &range);
+    if let (true, Some(now), Some(times)) = (from.times.is_empty(), now, to.times.get_mut(into)) {
+        times.fill(now);
     }
 }
 

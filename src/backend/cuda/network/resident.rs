@@ -445,8 +445,9 @@ impl Training for CudaTraining {
         for range in [wrapped, newest].into_iter().filter(|range| !range.is_empty()) {
             resident.training.write(&mut resident.samples, range, buffer.samples(), below)?;
         }
-        resident.usable = resident.training.usable(&resident.samples)?;
-        resident.usable_in_pool = resident.training.usable(&resident.pool.samples())?;
+        let pool = resident.pool.samples();
+        [resident.usable, resident.usable_in_pool] = resident.training.usable([&resident.samples, &pool])?;
+        drop(pool);
         (resident.mark, resident.base) = (Some(buffer.mark()), stamp);
         Ok(SyncedSamples { usable: resident.usable + resident.usable_in_pool, dropped: buffer.len() - resident.usable })
     }

@@ -361,23 +361,23 @@ impl DeviceTraining {
         Ok(())
     }
 
-    /// Number of samples with finite targets, which training uses.
+    /// Numbers of samples with finite targets, which training uses.
     ///
     /// # Errors
     /// Error of the driver.
-    pub fn usable(&self, buffer: &DeviceSamples) -> Result<usize, DeviceError> {
-        if buffer.is_empty() {
-            return Ok(0);
+    pub fn usable(&self, buffers: [&DeviceSamples; 2]) -> Result<[usize; 2], DeviceError> {
+        let count = self.gpu.upload("counters", &[0_u32; 2])?;
+        for (number, buffer) in buffers.into_iter().enumerate().filter(|(_, buffer)| !buffer.is_empty()) {
+            let to = count.address() + (number * size_of::<u32>()) as u64;
+            let (samples, n) = (buffer.samples.address(), buffer.len() as u32);
+            let mut call = self.gpu.work().launch_builder(&self.writer.kernels.usable);
+            call.arg(&samples).arg(&n).arg(&to);
+            // SAFETY: the arguments of `network_usable`; the buffer holds `n` samples.
+            unsafe { launch(&mut call, threads(buffer.len(), 256)) }?;
         }
-        let count = self.gpu.upload("a counter", &[0_u32])?;
-        let (samples, n, to) = (buffer.samples.address(), buffer.len() as u32, count.address());
-        let mut call = self.gpu.work().launch_builder(&self.writer.kernels.usable);
-        call.arg(&samples).arg(&n).arg(&to);
-        // SAFETY: the arguments of `network_usable`; the buffer holds `n` samples.
-        unsafe { launch(&mut call, threads(buffer.len(), 256)) }?;
-        let mut found = [0];
+        let mut found = [0; 2];
         count.read(&mut found)?;
-        Ok(found[0] as usize)
+        Ok(found.map(|found| found as usize))
     }
 
     /// Appends traced points on the device: `count` points (three f32 each, coordinates of `domain`, with times at the places of unused axes)

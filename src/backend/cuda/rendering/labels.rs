@@ -17,22 +17,58 @@ const MAX_LABELS: usize = 1 << 22;
 /// for validation, so the pool must not contain them.
 pub(in crate::cuda) const HELD_BACK: u32 = 3;
 
-/// A traced query.
-#[derive(Debug, Clone, Copy)]
-struct Label {
+/// Labels on the host. Arrays that are not requested are empty. They are plain and filled by one thread: it takes longer to hand some ten thousand
+/// labels to other threads than to copy them.
+#[derive(Debug, Default)]
+struct HostLabels {
     /// Domain coordinates, log-stretch.
-    at: [f32; 4],
-    /// Arrival point; NaN if arrival points are not requested.
-    arrival: DomainPoint,
-    /// Jacobian in domain coordinates; NaN if Jacobians are not requested.
-    jacobian: [f32; 9],
+    at: Vec<[f32; 4]>,
+    arrivals: Vec<[f32; 3]>,
+    /// In domain coordinates.
+    jacobians: Vec<[f32; 9]>,
 }
 
-impl Label {
-    fn point(&self) -> DomainPoint {
-        let [x, y, z, _] = self.at;
-        DomainPoint([x, y, z])
+impl HostLabels {
+    /// Those of these numbers, in their order.
+    fn chosen(&self, numbers: &[u32]) -> Self {
+        fn of<T: Copy>(values: &[T], numbers: &[u32]) -> Vec<T> {
+            let numbers = if values.is_empty() { &[] } else { numbers };
+            numbers.iter().map(|&number| values[number as usize]).collect()
+        }
+        Self { at: of(&self.at, numbers), arrivals: of(&self.arrivals, numbers), jacobians: of(&self.jacobians, numbers) }
     }
+
+    /// Drops those outside of a share.
+    fn thin(&mut self, share: LabelShare) {
+        let kept: Vec<u32> = (0..self.at.len() as u32).into_par_iter().filter(|&i| share.keeps(point(self.at[i as usize]))).collect();
+        *self = self.chosen(&kept);
+    }
+
+    fn append(&mut self, mut other: Self) {
+        if self.at.is_empty() {
+            *self = other;
+            return;
+        }
+        self.at.append(&mut other.at);
+        self.arrivals.append(&mut other.arrivals);
+        self.jacobians.append(&mut other.jacobians);
+    }
+
+    /// Sorts by place and log-stretch.
+    fn sort(&mut self) {
+        let bits = |at: [f32; 4]| at.map(f32::to_bits);
+        if self.arrivals.is_empty() && self.jacobians.is_empty() {
+            self.at.par_sort_unstable_by_key(|&at| bits(at));
+            return;
+        }
+        let mut order: Vec<u32> = (0..self.at.len() as u32).collect();
+        order.par_sort_unstable_by_key(|&number| bits(self.at[number as usize]));
+        *self = self.chosen(&order);
+    }
+}
+
+fn point([x, y, z, _]: [f32; 4]) -> DomainPoint {
+    DomainPoint([x, y, z])
 }
 
 /// Labels on the device.
@@ -46,10 +82,13 @@ struct Memory {
 /// The labels of one frame.
 pub struct Labels {
     share: LabelShare,
-    /// Labels on the host, read back whenever the device's memory was full.
-    back: Vec<Label>,
+    /// Read back whenever the device's memory was full.
+    back: HostLabels,
+    /// Shift of the share of those on the host.
+    taken: u32,
+    /// Shift of the share of the first labels that are on the device now; later ones have no larger share.
+    offered: u32,
     memory: Option<Memory>,
-    extras: Extras,
 }
 
 impl Labels {
@@ -66,7 +105,13 @@ impl Labels {
             let jacobians = extras.jacobian.then(|| gpu.alloc("labels", room)).transpose()?;
             Ok(Memory { at: gpu.alloc("labels", room)?, arrivals, jacobians })
         };
-        Ok(Self { share: LabelShare::new(keep, shift), back: Vec::new(), memory: (keep > 0).then(memory).transpose()?, extras })
+        Ok(Self {
+            share: LabelShare::new(keep, shift),
+            back: HostLabels::default(),
+            taken: shift,
+            offered: shift,
+            memory: (keep > 0).then(memory).transpose()?,
+        })
     }
 
     /// Returns the capacity for an expected number of labels: a margin of six standard deviations of the binomial count, and 64.
@@ -92,6 +137,9 @@ impl Labels {
         if full {
             self.take(stored)?;
         }
+        if full || stored == 0 {
+            self.offered = shift;
+        }
         Ok((LabelsArgument { at, arrivals, jacobians, length, capacity: capacity as u32, shift }, full))
     }
 
@@ -101,39 +149,41 @@ impl Labels {
     /// The device fails.
     pub fn take(&mut self, stored: usize) -> Result<(), DeviceError> {
         let Some(memory) = &self.memory else { return Ok(()) };
-        let mut at = vec![[0.0; 4]; stored.min(memory.at.len())];
-        memory.at.read(&mut at)?;
-        let mut arrivals = vec![DomainPoint([f32::NAN; 3]); at.len()];
-        if let Some(buffer) = &memory.arrivals {
-            buffer.read(bytemuck::cast_slice_mut(&mut arrivals))?;
+        let count = stored.min(memory.at.len());
+        let mut new = HostLabels { at: vec![[0.0; 4]; count], ..HostLabels::default() };
+        memory.at.read(&mut new.at)?;
+        if let Some(arrivals) = &memory.arrivals {
+            new.arrivals.resize(count, [f32::NAN; 3]);
+            arrivals.read(&mut new.arrivals)?;
         }
-        let mut jacobians = vec![[f32::NAN; 9]; at.len()];
-        if let Some(buffer) = &memory.jacobians {
-            buffer.read(&mut jacobians)?;
+        if let Some(jacobians) = &memory.jacobians {
+            new.jacobians.resize(count, [f32::NAN; 9]);
+            jacobians.read(&mut new.jacobians)?;
         }
-        let labels = at.into_iter().zip(arrivals).zip(jacobians);
-        self.back.extend(labels.map(|((at, arrival), jacobian)| Label { at, arrival, jacobian }));
-        self.thin();
-        Ok(())
-    }
-
-    fn thin(&mut self) {
         let share = self.share;
-        self.back.retain(|label| share.keeps(label.point()));
+        if share.shift > self.offered {
+            new.thin(share);
+        }
+        if share.shift > self.taken {
+            self.back.thin(share);
+        }
+        self.taken = share.shift;
+        self.back.append(new);
+        Ok(())
     }
 
     /// Returns the labels on the host, sorted, in unit coordinates of `domain`.
     pub fn finish(&mut self, domain: &Domain) -> Samples {
-        while self.share.halve_if_full(self.back.len()) {
-            self.thin();
+        while self.share.halve_if_full(self.back.at.len()) {
+            self.back.thin(self.share);
         }
-        self.back.par_sort_unstable_by_key(|label| label.at.map(f32::to_bits));
-        let labels_if = |wanted: bool| if wanted { &self.back[..] } else { &[] };
+        self.back.sort();
+        let HostLabels { at, arrivals, jacobians } = &self.back;
         Samples {
-            points: self.back.par_iter().map(|label| domain.to_unit(label.point())).collect(),
-            log_stretch: self.back.iter().map(|label| label.at[3]).collect(),
-            arrival: labels_if(self.extras.arrival).par_iter().map(|label| domain.to_unit_unclamped(label.arrival)).collect(),
-            jacobian: labels_if(self.extras.jacobian).par_iter().map(|label| unit_jacobian(domain, &label.jacobian)).collect(),
+            points: at.iter().map(|&at| domain.to_unit(point(at))).collect(),
+            log_stretch: at.iter().map(|at| at[3]).collect(),
+            arrival: arrivals.iter().map(|&arrival| domain.to_unit_unclamped(DomainPoint(arrival))).collect(),
+            jacobian: jacobians.iter().map(|jacobian| unit_jacobian(domain, jacobian)).collect(),
             ..Samples::default()
         }
     }
