@@ -152,7 +152,8 @@ pub struct AuditRequest<'a> {
     pub stop: &'a AtomicBool,
 }
 
-/// Result of the audit of one frame.
+/// Result of the audit of one frame; by default of one that is not audited.
+#[derive(Default)]
 pub struct AuditFindings {
     /// Number of points drawn.
     pub drawn: usize,
@@ -160,6 +161,8 @@ pub struct AuditFindings {
     pub points: usize,
     /// Mean of the particle lifetime over tau, over the points outside missing cells.
     pub mean_lifetime_share: f64,
+    /// Seconds of device time; 0 where the host measured.
+    pub device_seconds: f64,
     /// Largest finite traced log-stretch; minus infinity if no value is finite.
     pub peak: f32,
     /// The points outside missing cells as samples; empty if the request has `samples: None`.
@@ -187,6 +190,7 @@ pub fn audit(request: &AuditRequest<'_>, tracer: &dyn Trace, surrogate: Option<&
         drawn,
         points: samples.len(),
         mean_lifetime_share,
+        device_seconds: 0.0,
         peak: samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max),
         errors: surrogate.map(in_order).transpose()?,
         samples: if request.samples.is_some() { samples } else { Samples::default() },

@@ -30,8 +30,8 @@ pub(super) struct Work<S> {
 impl<S> Work<S> {
     /// Seconds of device time for the picture and its audit; wall-clock time if the CPU rendered.
     pub(super) fn device_share(&self) -> f64 {
-        let device = self.rendered.stats.device_seconds;
-        self.audit_seconds + if device > 0.0 { device } else { self.render_seconds }
+        let either = |device: f64, wall: f64| if device > 0.0 { device } else { wall };
+        either(self.rendered.stats.device_seconds, self.render_seconds) + either(self.audit.device_seconds, self.audit_seconds)
     }
 }
 

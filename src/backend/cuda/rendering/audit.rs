@@ -44,6 +44,9 @@ struct Memory {
     optical: Buffer<f32>,
     begins: Buffer<u32>,
     findings: Buffer<CellFindings>,
+    unit_back: Pinned<[f32; 3]>,
+    missing_back: Pinned<u8>,
+    traced_back: Pinned<f32>,
     optical_back: Pinned<f32>,
     findings_back: Pinned<CellFindings>,
 }
@@ -63,6 +66,9 @@ impl Memory {
             optical: gpu.alloc(what, points)?,
             begins: gpu.alloc(what, cells + 1)?,
             findings: gpu.alloc(what, cells)?,
+            unit_back: Pinned::new(gpu.context(), points)?,
+            missing_back: Pinned::new(gpu.context(), points)?,
+            traced_back: Pinned::new(gpu.context(), points)?,
             optical_back: Pinned::new(gpu.context(), points)?,
             findings_back: Pinned::new(gpu.context(), cells)?,
         })
@@ -157,8 +163,9 @@ impl Audits {
             optical: memory.optical.address(),
         };
         let (low, per_range, tau) = request.transfer.ramp_parts(tracer.host().tau());
-        let (mut optical, mut samples) = (Vec::with_capacity(strata.total()), Samples::default());
+        let (mut optical, mut samples, mut device_seconds) = (Vec::with_capacity(strata.total()), Samples::default(), 0.0);
         for batch in batches {
+            let began = gpu.mark()?;
             let count = in_batch(&batch);
             let argument = AuditBatchArgument { begins: memory.begins.address(), first: batch.start as u32, count: batch.len() as u32 };
             let warps = threads(batch.len() * WARP, 256);
@@ -173,11 +180,18 @@ impl Audits {
                 let mut call = stream.launch_builder(&self.measure);
                 launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
                 memory.optical_back.copy_from(gpu.work(), points.optical, count)?;
+                if request.samples.is_some() {
+                    memory.unit_back.copy_from(gpu.work(), points.unit, count)?;
+                    memory.missing_back.copy_from(gpu.work(), points.is_missing, count)?;
+                    memory.traced_back.copy_from(gpu.work(), points.traced, count)?;
+                }
             }
+            let ended = gpu.mark()?;
+            gpu.synchronize()?;
+            device_seconds += f64::from(gpu.milliseconds(&began, &ended)?) * 1e-3;
             if request.samples.is_some() {
                 keep(memory, count, domain, extras, &mut samples)?;
             }
-            gpu.synchronize()?;
             optical.extend_from_slice(&memory.optical_back.values()[..count]);
         }
         let from = memory.findings.address();
@@ -190,6 +204,7 @@ impl Audits {
             drawn: optical.len(),
             points: points as usize,
             mean_lifetime_share: findings.iter().map(|cell| cell.lifetimes).sum::<f64>() / points.max(1.0),
+            device_seconds,
             peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
             samples,
             errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),
@@ -197,16 +212,17 @@ impl Audits {
     }
 }
 
-/// Reads back the points of a batch that lie outside missing cells, in unit coordinates of `domain`.
+/// Keeps the points of a batch, which are on the host, that lie outside missing cells, in unit coordinates of `domain`.
 fn keep(memory: &Memory, count: usize, domain: &Domain, extras: Extras, samples: &mut Samples) -> Result<(), DeviceError> {
     fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
         let mut values = vec![zero; count];
         from.read(&mut values)?;
         Ok(values)
     }
-    let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
-    let missing = back(&memory.missing, 0, count)?;
+    let (unit, traced, missing) = (memory.unit_back.values(), memory.traced_back.values(), memory.missing_back.values());
     let present = || (0..count).filter(|&i| missing[i] == 0);
+    samples.points.reserve(count);
+    samples.log_stretch.reserve(count);
     samples.points.extend(present().map(|i| UnitPoint(unit[i])));
     samples.log_stretch.extend(present().map(|i| traced[i]));
     if let Some(buffer) = memory.arrivals.as_ref().filter(|_| extras.arrival) {
