@@ -131,6 +131,8 @@ fn a_fill_value_that_the_file_does_not_name_is_stated() {
     assert_eq!(node("", 4)[0], -9999.9, "taken as it is, with a warning");
     assert!(node("fill_value = -9999.9", 4)[3].is_nan(), "missing");
     assert_eq!(node("fill_value = -9999.9", 3)[0], 0.3);
+    // Only of velocities: the first coordinates are 0 too.
+    assert!(node("fill_value = 0", 0)[3].is_nan() && node("fill_value = 0", 3)[0] == 0.3);
 }
 
 const NX: usize = 12;

@@ -544,9 +544,10 @@ impl Archive {
             Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
             None => plans.iter().map(|plan| read_levels(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
         };
-        if !std::mem::replace(&mut self.fills_sought, true) {
-            for (values, axis) in components.iter().zip(["x", "y", "z"]) {
-                if let Some((fill, share)) = unnamed_fill(values) {
+        // Values that are resampled or packed are not those of the file.
+        if !std::mem::replace(&mut self.fills_sought, true) && self.resampling.is_none() {
+            for ((values, plan), axis) in components.iter().zip(plans).zip(["x", "y", "z"]) {
+                if let Some((fill, share)) = unnamed_fill(values).filter(|_| plan.packing.is_plain()) {
                     tracing::warn!(
                         "{}: the velocity along {axis} is {fill} at {:.1} % of the nodes, which looks like a fill value that the file does not name; \
                          archive.fill_value = {fill} takes it as missing",

@@ -64,6 +64,11 @@ impl Packing {
         Ok(Self { scale, offset, missing, valid: (low, high), wrap })
     }
 
+    /// Whether values are stored as they are.
+    pub fn is_plain(&self) -> bool {
+        self.scale == 1.0 && self.offset == 0.0
+    }
+
     /// The same with a further number, as it is stored, that stands for a missing value.
     pub fn with_missing(mut self, number: NumberType, fill: Option<f64>) -> Self {
         // In the precision of the file.

@@ -332,7 +332,7 @@ impl Planner<'_> {
             shape: found,
             dimensions: self.dimensions_of(variable),
             roles,
-            packing: self.packing(variable)?,
+            packing: self.velocity_packing(variable)?,
             factor,
             why,
             of_water: false,

@@ -165,8 +165,12 @@ impl<'a> Planner<'a> {
 
     /// Packing of a variable.
     pub fn packing(&self, variable: usize) -> Result<Packing, SourceError> {
-        let packing = Packing::of(self.variable(variable)).map_err(|what| self.misfit(variable, what))?;
-        Ok(packing.with_missing(self.variable(variable).number, self.settings.fill_value))
+        Packing::of(self.variable(variable)).map_err(|what| self.misfit(variable, what))
+    }
+
+    /// Packing of a component of the velocity, which may have a fill value that the file does not name.
+    pub fn velocity_packing(&self, variable: usize) -> Result<Packing, SourceError> {
+        Ok(self.packing(variable)?.with_missing(self.variable(variable).number, self.settings.fill_value))
     }
 
     /// True if longitudes that close the circle are periodic.
@@ -222,7 +226,7 @@ impl<'a> Planner<'a> {
             name: variable.name.clone(),
             shape: self.shape(candidate.variable),
             roles,
-            packing: self.packing(candidate.variable)?,
+            packing: self.velocity_packing(candidate.variable)?,
             why: candidate.why.clone(),
             dimensions: self.dimensions_of(candidate.variable),
             of_water: is_of_water(self.listing(), variable),

@@ -48,7 +48,7 @@ impl Planner<'_> {
             axis @ 0..=2 => Role::Axis(axis),
             _ => Role::Fixed(0),
         };
-        let (roles, packing) = ((0..rank).map(role).collect(), self.packing(variable)?);
+        let (roles, packing) = ((0..rank).map(role).collect(), self.velocity_packing(variable)?);
         let (shape, dimensions) = (self.shape(variable), self.dimensions_of(variable));
         let name = v.name.clone();
         Ok(ComponentPlan {
