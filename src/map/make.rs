@@ -194,9 +194,8 @@ fn colourless(traced: &[Traced], options: &MapOptions, rate: &Rate, shown: [f64;
         .map(|level| format!("--contour {level}: no line, since {there}"))
         .collect();
     let [low, high] = shown;
-    let within = values().filter(|v| (low..high).contains(v)).count();
     match options.range {
-        Some(_) if within == 0 => said.push(format!("--range {low},{high}: one colour, since {there}")),
+        Some(_) if least >= high || most <= low => said.push(format!("--range {low},{high}: one colour, since {there}")),
         None if !options.both => {
             let error = traced.iter().filter_map(|t| t.difference).reduce(f64::max);
             let tau = traced.iter().map(|t| t.tau).fold(0.0, f64::max);

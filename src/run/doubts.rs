@@ -15,8 +15,8 @@ const UNIFORM: f64 = 0.05;
 const UNIFORM_SHARE: f64 = 0.01;
 /// Cells of the domain along x, y and z that get a point each.
 const CELLS: [usize; 3] = [16, 16, 8];
-/// Share of these points that have to lie within the colours.
-const WITHIN: f64 = 0.001;
+/// Share of these points that is next to none.
+const FEW: f64 = 0.001;
 /// Random stream of these points.
 const STREAM: u64 = u64::MAX - 3;
 
@@ -43,7 +43,7 @@ pub fn uniform_ftle([low, high]: [f64; 2], tau: f64, error: Option<f64>, colours
     })
 }
 
-/// Warning for colours that hardly any FTLE of the domain lies within; `None` otherwise, and where all is missing.
+/// Warning for colours of which nearly the whole domain has one end, since its FTLE lies beyond; `None` otherwise, and where all is missing.
 pub(super) fn beyond_colours(tracer: &dyn Tracer, colours: &TransferRecord, time_unit: &str) -> Option<String> {
     let domain = tracer.domain();
     let [x, y, z] = CELLS;
@@ -56,15 +56,19 @@ pub(super) fn beyond_colours(tracer: &dyn Tracer, colours: &TransferRecord, time
     ftle.sort_unstable_by(f64::total_cmp);
     let (first, last) = (ftle.first()?, ftle.last()?);
     let TransferRecord { low, high, .. } = *colours;
-    let within = ftle.iter().filter(|f| (low..high).contains(f)).count() as f64;
-    (within < WITHIN * ftle.len() as f64).then(|| {
-        let per = if time_unit.is_empty() { "per time".to_owned() } else { format!("/{time_unit}") };
-        format!(
-            "transfer.low = {low:.3e} and transfer.high = {high:.3e} {per} show next to nothing: at {} points of the domain the FTLE is {first:.3e} to \
-             {last:.3e} {per}",
-            ftle.len()
-        )
-    })
+    let few = |count: usize| (count as f64) < FEW * ftle.len() as f64;
+    let from_low = ftle.iter().filter(|f| **f >= low).count();
+    let below_high = ftle.iter().filter(|f| **f < high).count();
+    let what = match (few(from_low), few(below_high)) {
+        (true, _) => format!("above transfer.low = {low:.3e}"),
+        (_, true) => format!("below transfer.high = {high:.3e}"),
+        _ => return None,
+    };
+    let per = if time_unit.is_empty() { "per time".to_owned() } else { format!("/{time_unit}") };
+    let points = ftle.len();
+    Some(format!(
+        "next to no FTLE lies {what} {per}: at {points} points of the domain it is {first:.3e} to {last:.3e} {per}, so that all has one colour"
+    ))
 }
 
 #[cfg(test)]
@@ -75,19 +79,15 @@ mod tests {
 
     #[test]
     fn colours_beyond_all_values_are_told() {
-        let saddle = VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, Domain::cuboid([-1.0; 3], [1.0; 3]));
+        let domain = Domain { dimensions: 2, ..Domain::cuboid([-1.0; 3], [1.0; 3]) };
+        let saddle = VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, domain);
         let tracer = cpu_tracer(saddle, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
         let warned = |low, high| beyond_colours(&tracer, &TransferRecord { low, high, extinction: 1.0 }, "s");
         assert_eq!(warned(0.5, 0.9), None);
         // A day's rate, taken for that of a second.
         let said = warned(86.4, 864.0).unwrap();
-        assert!(
-            said.starts_with(
-                "transfer.low = 8.640e1 and transfer.high = 8.640e2 /s show next to nothing: at 2048 points of the domain the FTLE is 7.0"
-            ),
-            "{said}"
-        );
-        assert!(warned(-9.0, -5.0).is_some());
+        assert!(said.starts_with("next to no FTLE lies above transfer.low = 8.640e1 /s: at 2048 points of the domain it is 7.0"), "{said}");
+        assert!(warned(-9.0, -5.0).unwrap().contains("lies below transfer.high = -5.000e0 /s"));
     }
 
     #[test]

@@ -266,5 +266,5 @@ fn differences(found: &str, expected: &str) -> Option<(String, String)> {
         let entry = |name: &&String| format!("{name} {}", of.get(*name).map_or("none".into(), Value::to_string));
         names.iter().map(entry).collect::<Vec<_>>().join(", ")
     };
-    Some((listed(&found), listed(&expected)))
+    (!names.is_empty()).then(|| (listed(&found), listed(&expected)))
 }

@@ -129,12 +129,23 @@ fn colours_are_told_and_what_has_none_is_warned_of() {
         let given = ["--set", "transfer.low=0", "--set", "transfer.high=1"];
         let (_, said) = drawn(folder.path(), &[&["render", source, "--out", "r.png", "--method", "reference"][..], set, &given].concat());
         assert!(said.contains(" to 1.000e0") && !said.contains("FTLE is uniform"), "as set: {said}");
-        assert!(!said.contains("show next to nothing"), "{said}");
+        assert!(!said.contains("next to no FTLE lies"), "{said}");
     }
     // Rates of a day, where those of a second are asked for.
     let given = ["--set", "transfer.low=0.1", "--set", "transfer.high=2"];
     let (_, said) = drawn(folder.path(), &[&["render", &file, "--out", "r.png"][..], &TWO_DAYS, &given].concat());
-    assert!(said.contains("transfer.low = 1.000e-1 and transfer.high = 2.000e0 /s show next to nothing"), "{said}");
+    assert!(said.contains("next to no FTLE lies above transfer.low = 1.000e-1 /s"), "{said}");
+}
+
+#[test]
+fn a_fill_value_that_the_file_does_not_name_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = winds(folder.path(), |x, y| if x < 0.4 { [-9999.0; 2] } else { waves(x, y) });
+    let told = "the velocity along x is -9999 at ";
+    let (_, said) = succeeds(folder.path(), &["inspect", &file]);
+    assert!(said.contains(told) && said.contains("archive.fill_value = -9999 takes it as missing"), "{said}");
+    let (_, said) = succeeds(folder.path(), &["inspect", &file, "--set", "archive.fill_value=-9999"]);
+    assert!(!said.contains(told), "{said}");
 }
 
 #[test]
