@@ -233,7 +233,7 @@ impl Session<'_> {
         let plan = setup.plan.clone();
         let (result, last, summary) = work(setup, &scene, &run_options, output, newest, maps, &stop.requested);
         let report = result?;
-        if let (Some(file), Some(found)) = (race, &report.race) {
+        if let (Some(file), Some(found)) = (race, report.race.as_ref().filter(|_| !report.is_steered)) {
             file.write(&plan, found.clone())?;
         }
         for warning in &report.warnings {

@@ -113,6 +113,8 @@ pub struct RunReport {
     pub slides_expected: Option<u64>,
     /// True if the caller stopped the run.
     pub interrupted: bool,
+    /// True if a command has changed tau, direction, colours or tolerance: races are no longer those of the scene.
+    pub is_steered: bool,
     /// True if the run ended since its time was up ([`RunOptions::seconds`]).
     pub time_is_up: bool,
     /// Seconds spent waiting for input.
@@ -775,6 +777,7 @@ impl<B: Backend> Cycle<'_, B> {
                 since_command = Some(0);
             }
             if commands >= Commands::Colours {
+                self.run.report.is_steered = true;
                 self.run.races.iter_mut().for_each(Races::begin_anew);
             }
             // The seeds of a map are those of any colours.
