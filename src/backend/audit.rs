@@ -152,8 +152,7 @@ pub struct AuditRequest<'a> {
     pub stop: &'a AtomicBool,
 }
 
-/// Result of the audit of one frame; by default of one that is not audited.
-#[derive(Default)]
+/// Result of the audit of one frame.
 pub struct AuditFindings {
     /// Number of points drawn.
     pub drawn: usize,
@@ -169,6 +168,21 @@ pub struct AuditFindings {
     pub samples: Samples,
     /// Residuals of the surrogate. `None` without a surrogate.
     pub errors: Option<Audited>,
+}
+
+impl AuditFindings {
+    /// Of a frame that is not audited.
+    pub fn none() -> Self {
+        Self {
+            drawn: 0,
+            points: 0,
+            mean_lifetime_share: 0.0,
+            device_seconds: 0.0,
+            peak: f32::NEG_INFINITY,
+            samples: Samples::default(),
+            errors: None,
+        }
+    }
 }
 
 /// Audits a frame on the CPU: draws the points, traces them, and measures the surrogate on them. The tracer and the surrogate may run on a device.

@@ -144,6 +144,7 @@ impl<B: Backend> Cycle<'_, B> {
         learning.start = slide.time;
         learning.resize = None;
         learning.peak = f32::NEG_INFINITY;
+        self.run.progress.last_audit = None;
         if learning.sizing.is_some() {
             // Sizes that the former map rejected may suit this one.
             learning.sizing = Some(Sizing::new(&learning.settings, &learning.network, &plan.domain)?);

@@ -72,6 +72,9 @@ impl Run<'_> {
             let renderer = &mut self.renderer;
             self.threads.render().install(|| renderer.set_scene(scene))?;
         }
+        if has_transfer || set.tolerance.is_some() || set.method.is_some() {
+            self.progress.last_audit = None;
+        }
         if has_transfer {
             let extinction = f64::from(self.renderer.transfer().extinction_max());
             let Range { low, high } = set.range.unwrap_or(Range { low: self.transfer.low, high: self.transfer.high });

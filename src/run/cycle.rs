@@ -8,6 +8,7 @@ use super::budget::FrameCost;
 use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::commands::Commands;
 use super::decision::{Decision, enter_colours, suited_network, why_steps};
+use super::frame::LastAudit;
 use super::integration::integration_warnings;
 use super::need::Need;
 use super::prepare::FLOW_MAP;
@@ -32,6 +33,7 @@ use crate::flow::{
     FlowError, FlowMap, IntegrationDifferences, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution,
 };
 use crate::progress::{self, Work};
+use crate::render::smooth::AUDIT_PAIRS;
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::source::SourceKind;
 use crate::source::live::NextWindow;
@@ -265,6 +267,8 @@ pub(super) struct RunProgress {
     pub(super) surrogate_seconds: f64,
     /// Seconds of races since the last frame.
     pub(super) raced: f64,
+    /// The latest audit of the present window and surrogate.
+    pub(super) last_audit: Option<LastAudit>,
 }
 
 impl RunProgress {
@@ -276,13 +280,23 @@ impl RunProgress {
         self.commands.retain(|command| !command.set.is_empty());
     }
 
-    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows, of which `refining` seconds
-    /// went to a finer table.
-    pub(super) fn affordable_samples(&self, settings: &RenderSettings, refining: f64) -> f64 {
+    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows, of which a part may have gone to a
+    /// finer table. The first frame of many is the march, with the samples that measure its error, and the next two make up for it.
+    pub(super) fn affordable_samples(&self, settings: &RenderSettings, place: &FramePlace) -> f64 {
         /// Samples a pixel of the first frame with a budget, whose cost is not known.
         const FIRST: f64 = 0.25;
-        let Some(milliseconds) = settings.budget else { return settings.samples };
-        let affordable = self.cost.map_or(FIRST, |cost| cost.samples(1e-3 * milliseconds, refining));
+        /// Those that measure the error of a march.
+        const SOON: f64 = 2.0 * AUDIT_PAIRS;
+        let Some(milliseconds) = settings.budget else {
+            return match place.after.filter(|_| settings.method == Method::TwoLevel && settings.samples > SOON) {
+                Some(0) => SOON,
+                Some(1) => settings.samples - SOON,
+                // A target is met by as many as it needs.
+                Some(2) if settings.until.is_none() => 2.0 * settings.samples,
+                _ => settings.samples,
+            };
+        };
+        let affordable = self.cost.map_or(FIRST, |cost| cost.samples(1e-3 * milliseconds, place.refining));
         // An even sixteenth at least, so that every tile gets samples.
         affordable.clamp(1.0 / 16.0, 4096.0)
     }
@@ -314,6 +328,9 @@ pub(super) struct Cycle<'a, B: Backend> {
     pub(super) compared: Option<Comparison>,
 }
 
+/// Frames of a slide from which on the first one is drawn soon, with few samples.
+const SOON_FROM: usize = 8;
+
 /// Place of a frame in its slide.
 #[derive(Clone, Copy)]
 pub(super) struct FramePlace {
@@ -322,6 +339,8 @@ pub(super) struct FramePlace {
     pub(super) preparing: f64,
     /// Seconds of tracing nodes of a finer table before the frame.
     pub(super) refining: f64,
+    /// Frames that its slide has had, if enough are expected for the first to be drawn soon; `None` with a budget or after a command.
+    pub(super) after: Option<usize>,
 }
 
 /// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame, which setting `options.abandon` ends
@@ -808,7 +827,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             slide.waited += std::mem::take(&mut self.run.progress.waited);
             let preparing = if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 };
-            let mut place = FramePlace { is_warmup: number < warmups, preparing, refining: 0.0 };
+            let mut place = FramePlace { is_warmup: number < warmups, preparing, refining: 0.0, after: None };
             if self.run.learning.resize.is_some() {
                 transaction!(self, slide, run, on => run.rebuild_surrogate(on));
                 self.run.resized();
@@ -828,6 +847,14 @@ impl<B: Backend> Cycle<'_, B> {
                     true => Some(since_command.map_or(0, |frames| FRAMES_WHILE_PAUSED.saturating_sub(frames))),
                     false => (!is_open).then(|| planned.saturating_sub(number)),
                 };
+                // How many frames a simulation leaves time for is not known before the slide.
+                let expected = match left {
+                    Some(left) => shown + left,
+                    None if slides.is_awaited().is_none() => usize::MAX,
+                    None => self.frames_before,
+                };
+                let is_soon = since_command.is_none() && expected >= SOON_FROM && self.run.render.budget.is_none();
+                place.after = is_soon.then_some(shown);
                 let is_only_slide = slide.index == 0 && slides.is_over();
                 place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
             }

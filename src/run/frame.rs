@@ -12,9 +12,9 @@ use super::slides::{Slide, Slides};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};
-use super::{FrameRecord, StageSeconds};
+use super::{FrameRecord, StageSeconds, TrustedError};
 use crate::backend::{
-    AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Rendered, Routing, Smooth, StartsAnew, Surrogate,
+    AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Rendered, Routing, Smooth, StartsAnew, Surrogate,
 };
 use crate::field::Domain;
 use crate::flow::VelocitySource;
@@ -42,6 +42,16 @@ struct Picture<'a> {
     is_live: bool,
     /// How much training is needed; `None` if the surrogate does not learn, or as long as is given.
     need: Option<f64>,
+}
+
+/// The latest audit of a smooth picture above a surrogate that does not learn. It holds for the frames behind it.
+pub(super) struct LastAudit {
+    trusted: Option<TrustedError>,
+    tolerance_excess: Option<f64>,
+    surrogate_psnr: Option<f64>,
+    mean_lifetime_share: f64,
+    /// Queries of the frames since.
+    queries: u64,
 }
 
 impl Run<'_> {
@@ -101,6 +111,11 @@ impl Run<'_> {
         if let Some(assessment) = assessment {
             self.take_in(on, assessment, &work.audit, samples, &mut record);
         }
+        let stays = method.is_smooth() && frozen.is_some() && !on.surrogate.as_ref().is_some_and(Surrogate::learns);
+        self.hold_audit(work.audit.drawn > 0, stays, work.rendered.tally.queries, &mut record);
+        if frozen.is_some() {
+            record.trusted_volume = gate.share();
+        }
         let learned = self.learning.unreported_since_last_frame();
         let train_seconds = learned.as_ref().map_or(0.0, |learned| learned.seconds);
         if let Some(learned) = &learned {
@@ -151,6 +166,24 @@ impl Run<'_> {
             color_bar: Some(Arc::clone(&self.color_bar)),
             gate: frozen.is_some().then(|| Arc::new(gate)),
         })
+    }
+
+    /// Keeps what an audit found, as long as it `stays` so, and enters it in the records of the frames that have none.
+    fn hold_audit(&mut self, is_audited: bool, stays: bool, queries: u64, record: &mut FrameRecord) {
+        let last = &mut self.progress.last_audit;
+        if is_audited {
+            *last = stays.then_some(LastAudit {
+                trusted: record.trusted_error,
+                tolerance_excess: record.tolerance_excess,
+                surrogate_psnr: record.surrogate_psnr,
+                mean_lifetime_share: record.mean_lifetime_share,
+                queries: 0,
+            });
+        } else if let Some(last) = last {
+            last.queries += queries;
+            (record.trusted_error, record.tolerance_excess) = (last.trusted, last.tolerance_excess);
+            (record.surrogate_psnr, record.mean_lifetime_share) = (last.surrogate_psnr, last.mean_lifetime_share);
+        }
     }
 
     /// Which queries the surrogate answers.
@@ -237,12 +270,16 @@ impl Run<'_> {
             // Its samples only measure the error.
             _ if method == Method::Marched => 2.0 * AUDIT_PAIRS,
             Some(samples) => samples as f64,
-            None => self.progress.affordable_samples(&self.render, picture.place.refining),
+            None => self.progress.affordable_samples(&self.render, &picture.place),
         };
-        let smooth = self.smooth(backend, surrogate.as_ref(), method, samples_per_pixel)?;
+        // A first frame that is drawn soon gets the nodes of the others.
+        let nodes_for = picture.place.after.map_or(samples_per_pixel, |_| self.render.samples);
+        let smooth = self.smooth(backend, surrogate.as_ref(), method, nodes_for)?;
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
+        // A surrogate that does not learn stays as it was audited until the queries warrant another audit.
+        let since_audit = self.progress.last_audit.as_ref().filter(|_| is_smooth && serves && !learns).map(|last| last.queries);
         let need = &mut self.learning.need;
         let (renderer, frame, stop, abandon) = (&mut self.renderer, self.progress.frame, self.stop, &*self.options.abandon);
         // Before training begins beside it.
@@ -271,12 +308,15 @@ impl Run<'_> {
             let render_seconds = begin.elapsed().as_secs_f64();
             drop(drawing);
             let (auditing, _audit) = (Instant::now(), InProgress::begin("measuring the error of the frame"));
-            let cells = trust.shape();
+            let (cells, least) = (trust.shape(), scene.trust.audit_min_per_cell);
+            let wanted = |queries: u64| (scene.trust.audit_share * queries as f64).ceil() as usize;
+            let queries = rendered.tally.queries;
+            if since_audit.is_some_and(|before| wanted(before + queries) < least * cells.iter().product::<usize>()) {
+                let audit = AuditFindings::none();
+                return Ok(Work { rendered, audit, samples_per_pixel, render_seconds, audit_seconds: 0.0 });
+            }
             let strata = match frozen {
-                Some(_) => {
-                    let wanted = (scene.trust.audit_share * rendered.tally.queries as f64).ceil() as usize;
-                    trust.audit_strata(picture.gate, scene.trust.audit_min_per_cell.max(wanted.div_ceil(cells.iter().product())))
-                }
+                Some(_) => trust.audit_strata(picture.gate, least.max(wanted(queries).div_ceil(cells.iter().product()))),
                 None => Strata::even(cells, 1),
             };
             let (seed, transfer, samples) = (scene.seed, renderer.transfer(), learns.then_some(extras));

@@ -51,6 +51,7 @@ impl Run<'_> {
         let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
         check_stop(self.stop)?;
         *surrogate = Some(built);
+        self.progress.last_audit = None;
         self.learning.need.restart();
         self.progress.surrogate_seconds = begin.elapsed().as_secs_f64();
         self.progress.warnings.extend(backend.warnings());
@@ -94,6 +95,7 @@ impl Run<'_> {
             self.threads.render().install(|| surrogate.window_slid(tracer, self.stop))?;
             check_stop(self.stop)?;
             self.progress.surrogate_seconds = begin.elapsed().as_secs_f64();
+            self.progress.last_audit = None;
         }
         Ok(())
     }
@@ -160,6 +162,7 @@ impl Run<'_> {
     /// Traces some points per cell before the first frame of a slide. They tighten the majorants, and their residuals build up trust without
     /// tracing a whole frame. Since they decide the gate, the stated error does not use them; it uses audit points only. A map has neither.
     pub(super) fn probe<B: Backend>(&mut self, on: &mut On<B>, slide: u64) -> Result<(), RunEnd> {
+        self.progress.last_audit = None;
         if self.render.method == Method::Map {
             return Ok(());
         }

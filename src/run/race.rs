@@ -302,7 +302,7 @@ impl<B: Backend> Cycle<'_, B> {
         sink(Event::Note(format!("render.method = \"auto\": {} from slide {} on, {}", race.method.name(), race.slide + 1, race.why())));
         with!(&mut self.session, on => on.picture = Default::default());
         run.render = drawn_by(&run.plan.scene.render, race.method, run.render.budget);
-        run.progress.cost = None;
+        (run.progress.cost, run.progress.last_audit) = (None, None);
         run.draw_color_bar();
         run.options.steering.iter().for_each(|steering| steering.keep_method(race.method));
     }

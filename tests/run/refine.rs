@@ -30,7 +30,9 @@ fn a_picture_that_stands_still_starts_anew_on_a_finer_table() {
     let (open, nodes) = replay(folder.path(), "open", &[]);
     // 47 x 23 x 23 nodes are the work of 1.5 frames of 32 x 16 pixels with two samples, 16 nodes for each: frames 1 and 2.
     let samples: Vec<f64> = open.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
-    assert_eq!(samples, [2.0, 4.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0].repeat(2), "each window begins with the nodes of the data");
+    // The first of eight frames has an eighth of a sample, the second what is missing, and the third the samples of two.
+    assert_eq!(samples, [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0].repeat(2), "each window begins with the nodes of the data");
+    assert!(open.iter().step_by(8).all(|record| record.samples_per_pixel == 0.125));
     let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 0.0).collect();
     assert_eq!(refined, [false, true, true, false, false, false, false, false].repeat(2));
     assert_eq!(nodes.len(), 1);
@@ -43,6 +45,24 @@ fn a_picture_that_stands_still_starts_anew_on_a_finer_table() {
         assert!(samples.windows(2).all(|pair| pair[1] > pair[0]), "{keys:?}: {samples:?}");
         assert!(kept.iter().all(|record| record.seconds.refine == 0.0), "{keys:?}");
     }
+}
+
+#[test]
+fn a_table_is_audited_as_its_queries_warrant() {
+    let folder = tempfile::tempdir().unwrap();
+    let (records, _) = replay(folder.path(), "few", &["render.samples=0.1", "surrogate.refine=false"]);
+    for slide in records.chunks(8) {
+        assert!(slide[0].audited > 0 && slide[0].surrogate_psnr.is_some(), "each window is audited");
+        assert!(slide.iter().filter(|record| record.audited == 0).count() > 4);
+        for pair in slide.windows(2).filter(|pair| pair[1].audited == 0) {
+            let [before, after] =
+                [&pair[0], &pair[1]].map(|r| (r.trusted_error, r.tolerance_excess, r.surrogate_psnr, r.mean_lifetime_share));
+            assert_eq!(before, after, "what the last audit found");
+        }
+    }
+    // Many queries warrant an audit of each frame.
+    let (records, _) = replay(folder.path(), "many", &["render.samples=64", "surrogate.refine=false", "trust.audit_share=1"]);
+    assert!(records.chunks(8).flat_map(|slide| &slide[2..]).all(|record| record.audited > 0));
 }
 
 /// A budget buys nodes too. That of this run has time for many times the nodes, so that a slow machine refines the table as well.
