@@ -1,6 +1,6 @@
 //! `ridgewatch attach`.
 
-use super::common::{CHART, Common, RaceFile, Usage, beside_scene, device, is_config, located};
+use super::common::{Common, Usage, is_config, located};
 use super::process::Nice;
 use super::session::{Follows, RunArguments, Session};
 use super::{messages, notify};
@@ -77,8 +77,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
     };
     let follows = Some(Follows { checkpoint_seconds: CHECKPOINT_SECONDS, resume_if_fit, wanted });
     let configs: Vec<PathBuf> = options.paths.iter().filter(|path| is_config(path)).cloned().collect();
-    let race = RaceFile::of(common, &scene, &configs, &device(common, &scene)?)?;
-    Session { common, options: &options.run, scene, text, follows, chart: beside_scene(&configs, CHART), race }.run(open)
+    Session { common, options: &options.run, scene, text, follows, paths: &configs }.run(open)
 }
 
 /// Reads the scene, with the places of the simulation from the command line.

@@ -1,6 +1,6 @@
 //! `ridgewatch replay`.
 
-use super::common::{CHART, Common, RaceFile, beside_scene, device, open_by, scene, seconds};
+use super::common::{Common, open_by, scene, seconds};
 use super::session::{RunArguments, Session};
 use anyhow::Result;
 use ridgewatch::run::Setup;
@@ -28,10 +28,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.archive.follow = Some(seconds);
         scene.set_by("archive.follow", format!("--follow={seconds}"));
     }
-    let device = device(common, &scene)?;
-    let race = RaceFile::of(common, &scene, &options.paths, &device)?;
     let text = scene.to_toml()?;
-    let chart = beside_scene(&options.paths, CHART);
-    Session { common, options: &options.run, scene, text, follows: None, chart, race }
+    Session { common, options: &options.run, scene, text, follows: None, paths: &options.paths }
         .run(|scene, _| open_by(scene, Setup::for_run).map(Some))
 }

@@ -1,8 +1,8 @@
 //! A run of `replay` or `attach`: from a scene to a run folder and the socket.
 
 use super::common::{
-    Common, Interrupted, RaceFile, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text,
-    seconds, text_with_tau, verifies_nothing, word,
+    CHART, Common, Interrupted, RaceFile, Usage, beside_scene, check_folder, check_learns, chosen_steps, device, located, method,
+    print_json, print_text, seconds, text_with_tau, verifies_nothing, word,
 };
 use super::dashboard::{self, Reach};
 use super::signals::Stop;
@@ -121,10 +121,8 @@ pub struct Session<'a> {
     pub text: String,
     /// `None` for replays.
     pub follows: Option<Follows>,
-    /// Where a chart of the scene would be.
-    pub chart: Option<PathBuf>,
-    /// Where the last race of methods is kept; `None` if it is not.
-    pub race: Option<RaceFile>,
+    /// The scene file, beside which its chart and its last race of methods are kept; data files have neither.
+    pub paths: &'a [PathBuf],
 }
 
 /// What a run that follows a simulation has besides.
@@ -140,7 +138,7 @@ pub struct Follows {
 impl Session<'_> {
     /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
     pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
-        let Self { common, options, scene, text, follows: following, chart, race } = self;
+        let Self { common, options, scene, text, follows: following, paths } = self;
         let wanted = following.as_ref().filter(|_| !options.overwrite).map(|following| following.wanted.as_path());
         // Before any wait or work. The folder is checked again when it is created, in case another run takes it meanwhile.
         match RunFolder::refuse_occupied(&options.out, options.overwrite) {
@@ -162,7 +160,6 @@ impl Session<'_> {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
-        setup.earlier_race = race.as_ref().and_then(|race| race.read(&setup.plan));
         for usage in [verifies_nothing(&setup, options.verify), films_nothing(&setup, options.movie_of)].into_iter().flatten() {
             if !follows {
                 bail!(usage);
@@ -172,6 +169,8 @@ impl Session<'_> {
         }
         let text = text_with_tau(&scene, &setup, text)?;
         let device = device(common, &scene)?;
+        let race = RaceFile::of(common, &scene, paths, &device)?;
+        setup.earlier_race = race.as_ref().and_then(|race| race.read(&setup.plan));
         if let Some(checkpoint) = &options.checkpoint {
             check_folder(checkpoint)?;
         }
@@ -212,7 +211,7 @@ impl Session<'_> {
         output.describe(&newest.about());
         let dashboard = page.zip(output.endpoint()).and_then(|(page, endpoint)| {
             let steer = commands.as_ref().map(|commands| commands.connection().to_owned());
-            let chart = chart.as_deref().and_then(|file| std::fs::read(file).ok());
+            let chart = beside_scene(paths, CHART).and_then(|file| std::fs::read(file).ok());
             let (endpoint, newest) = (endpoint.to_owned(), Some(Arc::clone(&newest)));
             dashboard::beside(common, &options.reach, DashboardSettings { endpoint, steer, newest, run: Some(out.clone()), chart, ..page })
         });

@@ -253,7 +253,7 @@ impl Setup {
 /// Note on a tau that ends before the next snapshot: the number may have been meant in another unit.
 fn below_interval(source: &dyn SnapshotSource, tau: f64) -> Option<String> {
     let unit = source.describe().time_unit;
-    let interval = source.times().windows(2).map(|pair| pair[1] - pair[0]).reduce(f64::min)?;
+    let (_, interval) = source.span_and_interval().ok()?;
     let with_unit = if unit == "s" { "; durations may have a unit, as \"5 days\"" } else { "" };
     (tau < interval).then(|| {
         let [tau, interval] = [tau, interval].map(|time| duration(time, &unit));

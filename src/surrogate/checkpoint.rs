@@ -254,6 +254,7 @@ impl Opened {
         Ok(checkpoint)
     }
 }
+
 /// The entries in which two objects in JSON differ, as `name value`; `None` for texts of another kind.
 fn differences(found: &str, expected: &str) -> Option<(String, String)> {
     let [Value::Object(found), Value::Object(expected)] = [found, expected].map(|text| serde_json::from_str(text).unwrap_or_default())
