@@ -139,7 +139,7 @@ fn panels(chart: &Chart) -> Vec<Panel> {
             panels.push(ftle_panel(panel, &unit, title, "seconds", |point| point.seconds(samples)));
         }
     }
-    panels.extend(chart.pictures.as_ref().filter(|panel| !panel.curves.is_empty()).map(picture_panel));
+    panels.extend(chart.pictures.as_ref().filter(|panel| curves(panel).next().is_some()).map(picture_panel));
     panels.extend(chart.pictures.as_ref().and_then(sliding_panel));
     if let Some(panel) = &chart.scaling {
         let tau = if chart.time_unit.is_empty() { "tau".to_owned() } else { format!("tau, {}", chart.time_unit) };
@@ -177,9 +177,15 @@ fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl 
     }
 }
 
+/// The curves of the volume view, and that of the map.
+fn curves(panel: &PicturePanel) -> impl Iterator<Item = (String, &PictureCurve)> {
+    let map = panel.map.iter().map(|curve| (format!("{} (of its FTLE)", curve.name()), curve));
+    panel.curves.iter().map(|curve| (curve.name(), curve)).chain(map)
+}
+
 fn picture_panel(panel: &PicturePanel) -> Panel {
-    let series = panel.curves.iter().map(|curve| Series {
-        name: curve.name(),
+    let series = curves(panel).map(|(name, curve)| Series {
+        name,
         points: curve.frames.iter().map(|frame| (frame.seconds, frame.psnr)).collect(),
         is_line: true,
     });
@@ -200,7 +206,7 @@ fn picture_panel(panel: &PicturePanel) -> Panel {
 fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
     let at = |curve: &PictureCurve| curve.sliding.and_then(|sliding| Some((1.0 / sliding.frames_per_second, sliding.psnr?)));
     // All curves, so that a method has the colour that it has beside.
-    let series = panel.curves.iter().map(|curve| Series { name: curve.name(), points: at(curve).into_iter().collect(), is_line: false });
+    let series = curves(panel).map(|(name, curve)| Series { name, points: at(curve).into_iter().collect(), is_line: false });
     let series: Vec<Series> = series.collect();
     series.iter().any(|series| !series.points.is_empty()).then(|| Panel {
         title: "Pictures: error against time of a frame, window that slides at every frame".into(),

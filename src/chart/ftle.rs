@@ -187,6 +187,12 @@ impl Opened {
         }
     }
 
+    /// Steps that the log-stretch asks for, also if the scene gives their number; `None` if the flow is integrated without a choice.
+    pub(super) fn chosen_steps(&self, pool: &rayon::ThreadPool) -> Result<Option<usize>, RunError> {
+        let auto = FlowMap { steps: self.auto_steps(), ..self.plan.map.clone() };
+        Ok(pool.install(|| self.on_cpu(&auto))?.step_choice().map(|choice| choice.steps))
+    }
+
     /// Uniform random points in unit and in domain coordinates; in two dimensions all lie in the middle of the slab.
     pub(super) fn random_points(&self, count: usize) -> (Vec<UnitPoint>, Vec<DomainPoint>) {
         let Points { unit, domain } = Points::random(self, count, 5);
@@ -343,8 +349,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let known: Vec<f64> = truth.iter().copied().filter(|f| f.is_finite()).collect();
     let truth_rms = (known.iter().map(|f| f * f).sum::<f64>() / known.len().max(1) as f64).sqrt();
     let ramp = ramp(opened, &known);
-    let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
-    let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
+    let chosen_steps = opened.chosen_steps(&charting.pool)?;
     let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
     let mut bench =
         Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, nodes_per_second: None, found: Vec::new() };

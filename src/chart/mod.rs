@@ -8,6 +8,7 @@
 mod draw;
 mod front;
 mod ftle;
+mod map;
 mod picture;
 mod scaling;
 mod slides;
@@ -190,7 +191,7 @@ pub fn chart(
         None
     };
     let scaling = if options.scaling { Some(charting.with_share(0.15, |charting| scaling::panel(charting, &opened))?) } else { None };
-    let pictures = if options.pictures { Some(picture::panel(&mut charting, &slides, auto_is_map)?) } else { None };
+    let pictures = if options.pictures { Some(picture::panel(&mut charting, &opened, &slides, auto_is_map)?) } else { None };
     Ok(Chart {
         scene: settings.title.clone(),
         source,

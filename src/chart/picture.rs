@@ -1,8 +1,9 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
+use super::ftle::Opened;
 use super::slides::FirstSlides;
 use super::still::{colours_of, compile, still};
-use super::{Charting, with_method};
+use super::{Charting, map, with_method};
 use crate::publish::compare_films;
 use crate::render::smooth::{LIT, noise_psnr, squared_slope};
 use crate::render::{Film, Method};
@@ -22,7 +23,7 @@ pub(super) const RESOLVED: f64 = 6.0;
 /// PSNR beyond which a curve ends.
 const ENOUGH: f64 = 47.0;
 /// Longest curve, in seconds, on the CPU and on a GPU; twice that if a network learns on the way.
-const LONGEST: [f64; 2] = [20.0, 6.0];
+pub(super) const LONGEST: [f64; 2] = [20.0, 6.0];
 /// Samples a pixel of a frame of the truth.
 const TRUTH_SAMPLES: f64 = 16.0;
 /// Slides of a sliding window; the first one is not counted.
@@ -35,11 +36,11 @@ pub struct PicturePoint {
     pub seconds: f64,
     /// Samples a pixel so far.
     pub samples: f64,
-    /// True PSNR of the tone-mapped picture over lit pixels, in decibels.
+    /// True PSNR of the tone-mapped picture over lit pixels, in decibels; of a map that of its FTLE, with the range of its colours as peak.
     pub psnr: f64,
     /// The same over all pixels.
     pub psnr_all: f64,
-    /// Mean of squared error / (radiance^2 + 0.01) over lit pixels, linear.
+    /// Mean of squared error / (radiance^2 + 0.01) over lit pixels, linear; of a map with the share of the range in place of the radiance.
     pub relmse: f64,
     /// Structural similarity of the tone-mapped luma with the mean of the truth's halves; of the frames that reach [`TARGETS`] and of the last one.
     pub ssim: Option<f64>,
@@ -52,7 +53,7 @@ pub struct PicturePoint {
 pub struct PictureCurve {
     /// Method.
     pub method: String,
-    /// Kind of its surrogate; `None` for `reference`.
+    /// Kind of its surrogate; `None` for `reference` and `map`.
     pub surrogate: Option<String>,
     /// Bytes of the surrogate.
     pub bytes: usize,
@@ -73,7 +74,7 @@ pub struct Sliding {
 
 impl PictureCurve {
     pub(super) fn new(method: Method, kind: Kind) -> Self {
-        let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
+        let surrogate = method.has_surrogate().then(|| kind.name().to_owned());
         Self { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None }
     }
 
@@ -121,13 +122,16 @@ pub struct PicturePanel {
     /// PSNR over lit pixels of the mean of the halves, whose noise is taken off from errors.
     #[serde(deserialize_with = "super::number_or_nan")]
     pub truth_psnr: f64,
-    /// One curve per method and surrogate.
+    /// One curve per method and surrogate, of the volume view.
     pub curves: Vec<PictureCurve>,
+    /// The curve of the flow's map, which is another picture, against its own truth; `None` in three dimensions, and if it was not measured.
+    #[serde(default)]
+    pub map: Option<PictureCurve>,
     /// Kind of the scene's surrogate.
     pub kind: Kind,
     /// The same race as that of `render.method = "auto"`, by the true errors of these curves; `None` if no method reached its target.
     pub race: Option<Race>,
-    /// True if `render.method = "auto"` draws the scene as a map, which is none of these curves.
+    /// True if `render.method = "auto"` draws the scene as a map.
     #[serde(default)]
     pub auto_is_map: bool,
 }
@@ -139,6 +143,8 @@ pub struct Truth {
     pub halves: [Film; 2],
     /// Mean of both.
     pub mean: Film,
+    /// Lower and upper end of a map's colours, 1/time; `None` of pictures of volumes.
+    pub(super) range: Option<[f64; 2]>,
 }
 
 impl Truth {
@@ -149,7 +155,12 @@ impl Truth {
     pub fn new(halves: [Film; 2]) -> Result<Self, RunError> {
         let mut mean = halves[0].clone();
         mean.accumulate(&halves[1])?;
-        Ok(Self { halves, mean })
+        Ok(Self { halves, mean, range: None })
+    }
+
+    /// [`picture_errors`], or [`map::errors`] of maps.
+    fn errors(&self, film: &Film, tone_map: [f64; 3]) -> PictureErrors {
+        self.range.map_or_else(|| picture_errors(film, self, tone_map), |range| map::errors(film, &self.halves, range))
     }
 
     /// True if a pixel is lit: its opacity is above [`LIT`].
@@ -230,9 +241,6 @@ pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> Picture
         }
     };
     let sums = (0..film.rgba.len()).into_par_iter().with_min_len(1 << 12).map(of_pixel).reduce(ErrorSums::default, |a, b| a + b);
-    // The truth's noise may hide the error, or leave its square below zero.
-    let hidden = 10f64.powf(-0.1 * RESOLVED);
-    let decibels = |[square, noise]: [f64; 2], count: f64| -10.0 * (square.max(hidden * noise) / count).max(1e-12).log10();
     PictureErrors {
         rms: (sums.linear / sums.lit).max(0.0).sqrt(),
         psnr: decibels(sums.mapped[0], sums.lit),
@@ -241,35 +249,66 @@ pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> Picture
     }
 }
 
+/// PSNR of a sum of squared errors over `count` values, whose truth has this sum of squared noise: it may hide the error, or leave its square below zero.
+pub(super) fn decibels([square, noise]: [f64; 2], count: f64) -> f64 {
+    -10.0 * (square.max(10f64.powf(-0.1 * RESOLVED) * noise) / count).max(1e-12).log10()
+}
+
+/// What the pictures of a panel share.
+pub(super) struct Windows<'a> {
+    options: RunOptions,
+    pub(super) slides: &'a FirstSlides,
+    stop: &'a AtomicBool,
+}
+
 /// Renders the truth and the curves.
-pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_map: bool) -> Result<PicturePanel, RunError> {
-    let mut settings = charting.settings.clone();
-    settings.transfer = Some(colours_of(&settings, charting.device, slides)?);
+pub(super) fn panel(
+    charting: &mut Charting<'_>,
+    opened: &Opened,
+    slides: &FirstSlides,
+    auto_is_map: bool,
+) -> Result<PicturePanel, RunError> {
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
+    let windows = Windows { options, slides, stop: charting.stop };
+    let map = if opened.plan.domain.dimensions == 2 { map::curve(charting, opened, &windows)? } else { None };
+    Ok(PicturePanel { map, auto_is_map, ..volumes(charting, &windows)? })
+}
+
+/// Two independent halves of a slide's picture, rendered for so many seconds in all, and the samples a pixel of both.
+pub(super) fn truth(windows: &Windows<'_>, scene: &Settings, slide: usize, seconds: f64) -> Result<(Truth, f64), RunError> {
+    let mut samples = 0.0;
+    // Seeds of their own: the charted pictures must not share random numbers with the truth.
+    let mut half = |seed: u64| {
+        let mut scene = Settings { seed, ..scene.clone() };
+        scene.render.samples = TRUTH_SAMPLES;
+        // Opening the source does not count.
+        let mut began = None;
+        let mut sum = Film::new(scene.render.width, scene.render.height);
+        let mut last = None;
+        let accumulates = scene.render.method.accumulates();
+        still(scene, &windows.options, (windows.slides, slide), |frame| {
+            samples += TRUTH_SAMPLES;
+            // Both films have the size of the scene.
+            let whole = accumulates || sum.accumulate(&frame.film).is_ok();
+            last = accumulates.then(|| frame.film.clone());
+            whole && began.get_or_insert_with(Instant::now).elapsed().as_secs_f64() < 0.5 * seconds && !windows.stop.load(Ordering::Relaxed)
+        })?;
+        Ok::<_, RunError>(last.map_or(sum, |film| (*film).clone()))
+    };
+    let halves = [half(scene.seed ^ 0x5eed_0001)?, half(scene.seed ^ 0x5eed_0002)?];
+    Ok((Truth::new(halves)?, samples))
+}
+
+/// The truth and the curves of the volume view.
+fn volumes(charting: &mut Charting<'_>, windows: &Windows<'_>) -> Result<PicturePanel, RunError> {
+    let slides = windows.slides;
+    let mut settings = charting.settings.clone();
+    settings.transfer = Some(colours_of(&settings, Method::Reference, charting.device, slides)?);
     let size = [settings.render.width, settings.render.height];
     let left = charting.left();
     let true_picture = |slide: usize, share: f64| {
         (charting.tell)("the true picture: two halves of reference");
-        let mut samples = 0.0;
-        // Seeds of their own: the charted pictures must not share random numbers with the truth.
-        let mut half = |seed: u64| {
-            let mut scene = Settings { seed, ..with_method(&settings, Method::Reference, Kind::Table) };
-            scene.render.samples = TRUTH_SAMPLES;
-            // Opening the source does not count.
-            let mut began = None;
-            let mut sum = Film::new(size[0], size[1]);
-            still(scene, &options, (slides, slide), |frame| {
-                samples += TRUTH_SAMPLES;
-                // Both films have the size of the scene.
-                let whole = sum.accumulate(&frame.film).is_ok();
-                whole
-                    && began.get_or_insert_with(Instant::now).elapsed().as_secs_f64() < 0.5 * share * left
-                    && !charting.stop.load(Ordering::Relaxed)
-            })?;
-            Ok::<_, RunError>(sum)
-        };
-        let halves = [half(settings.seed ^ 0x5eed_0001)?, half(settings.seed ^ 0x5eed_0002)?];
-        Ok::<_, RunError>((Truth::new(halves)?, samples))
+        truth(windows, &with_method(&settings, Method::Reference, Kind::Table), slide, share * left)
     };
     let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?;
     if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
@@ -279,9 +318,10 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_m
             truth_samples: samples,
             truth_psnr: f64::INFINITY,
             curves: Vec::new(),
+            map: None,
             kind: settings.surrogate.kind,
             race: None,
-            auto_is_map,
+            auto_is_map: false,
         });
     }
     let last_truth = if slides.count() < SLIDES {
@@ -310,7 +350,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_m
         (Method::TwoLevel, Kind::Network),
         (Method::Gated, Kind::Network),
     ];
-    if let Err(error) = compile(&settings, &options, slides) {
+    if let Err(error) = compile(&settings, &windows.options, slides) {
         charting.refused("a first frame, which compiles kernels", error)?;
     }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
@@ -321,7 +361,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_m
         let most = LONGEST[usize::from(charting.device.is_gpu())] * if kind == Kind::Network { 2.0 } else { 1.0 };
         let longest = (charting.left() / (candidates.len() - number) as f64).min(most);
         let scene = with_method(&settings, method, kind);
-        match measure(&scene, &options, slides, &truth, 0.8 * longest, charting.stop, &mut curve.frames) {
+        match measure(windows, &scene, &truth, 0.8 * longest, &mut curve.frames) {
             Ok(bytes) => curve.bytes = bytes,
             Err(error) => {
                 charting.refused(format_args!("pictures by {}", curve.name()), error)?;
@@ -329,15 +369,15 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_m
             }
         }
         if slides.count() >= SLIDES {
-            match sliding(&scene, &options, slides, last_truth.as_ref(), 0.2 * longest, charting.stop) {
+            match sliding(windows, &scene, last_truth.as_ref(), 0.2 * longest) {
                 Ok(found) => curve.sliding = found,
                 Err(error) => charting.refused(format_args!("a sliding window by {}", curve.name()), error)?,
             }
         }
         curves.push(curve);
     }
-    let mut panel =
-        PicturePanel { size, truth_samples: samples, truth_psnr, curves, kind: settings.surrogate.kind, race: None, auto_is_map };
+    let kind = settings.surrogate.kind;
+    let mut panel = PicturePanel { size, truth_samples: samples, truth_psnr, curves, map: None, kind, race: None, auto_is_map: false };
     panel.race = Race::of_times(|method, target| {
         let curve = panel.curve(method)?;
         match method {
@@ -350,25 +390,23 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides, auto_is_m
 }
 
 /// Frames of a still window for some seconds; returns the bytes of the surrogate.
-fn measure(
+pub(super) fn measure(
+    windows: &Windows<'_>,
     scene: &Settings,
-    options: &RunOptions,
-    slides: &FirstSlides,
     truth: &Truth,
     longest: f64,
-    stop: &AtomicBool,
     frames: &mut Vec<PicturePoint>,
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
     let (mut seconds, mut last, mut before) = (0.0, None, f64::NEG_INFINITY);
     let ssim = |film: &Film, tone_map| compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
-    let bytes = still(scene.clone(), options, (slides, 0), |frame| {
+    let bytes = still(scene.clone(), &windows.options, (windows.slides, 0), |frame| {
         let record = &frame.record;
         seconds += record.seconds.slide + record.seconds.total;
         // Films of the other methods have their own samples only.
-        let accumulated = scene.render.method.is_smooth() || sum.accumulate(&frame.film).is_err();
+        let accumulated = scene.render.method.accumulates() || sum.accumulate(&frame.film).is_err();
         let film = if accumulated { &*frame.film } else { &sum };
-        let errors = picture_errors(film, truth, frame.tone_map);
+        let errors = truth.errors(film, frame.tone_map);
         let reaches = TARGETS.iter().any(|target| before < *target && *target <= errors.psnr);
         before = errors.psnr;
         let own = record.samples_per_pixel * (record.frame + 1) as f64;
@@ -382,24 +420,17 @@ fn measure(
             stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
         });
         last = Some((frame.film.clone(), frame.tone_map));
-        errors.psnr < ENOUGH && seconds < longest && !stop.load(Ordering::Relaxed)
+        errors.psnr < ENOUGH && seconds < longest && !windows.stop.load(Ordering::Relaxed)
     })?;
     if let (Some((film, tone_map)), Some(point)) = (last, frames.last_mut()) {
-        let film = if scene.render.method.is_smooth() { &*film } else { &sum };
+        let film = if scene.render.method.accumulates() { &*film } else { &sum };
         point.ssim = ssim(film, tone_map);
     }
     Ok(bytes)
 }
 
 /// A window that slides at every frame; `None` if a frame took too long.
-fn sliding(
-    scene: &Settings,
-    options: &RunOptions,
-    slides: &FirstSlides,
-    truth: Option<&Truth>,
-    longest: f64,
-    stop: &AtomicBool,
-) -> Result<Option<Sliding>, RunError> {
+pub(super) fn sliding(windows: &Windows<'_>, scene: &Settings, truth: Option<&Truth>, longest: f64) -> Result<Option<Sliding>, RunError> {
     let mut scene = scene.clone();
     (scene.time.frames_per_slide, scene.time.warmup_frames) = (1, 0);
     let (mut seconds, mut frames, mut psnr) = (0.0, 0, None);
@@ -411,11 +442,11 @@ fn sliding(
             seconds += record.seconds.slide + record.seconds.total;
             frames += 1;
             if record.slide + 1 == SLIDES as u64 {
-                psnr = truth.map(|truth| picture_errors(&film, truth, tone_map).psnr);
+                psnr = truth.map(|truth| truth.errors(&film, tone_map).psnr);
             }
-            enough.store(seconds > longest || stop.load(Ordering::Relaxed), Ordering::Relaxed);
+            enough.store(seconds > longest || windows.stop.load(Ordering::Relaxed), Ordering::Relaxed);
         }
     };
-    run(slides.setup(scene, 0)?, options, &mut sink, &enough)?;
+    run(windows.slides.setup(scene, 0)?, &windows.options, &mut sink, &enough)?;
     Ok((frames > 0).then(|| Sliding { frames_per_second: f64::from(frames) / seconds, psnr }))
 }

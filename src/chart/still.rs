@@ -15,12 +15,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// # Errors
 /// The source cannot be opened, or the device fails.
 pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSettings, RunError> {
-    colours_of(settings, device, &FirstSlides::read(settings, 1, &AtomicBool::new(false))?)
+    colours_of(settings, Method::Reference, device, &FirstSlides::read(settings, 1, &AtomicBool::new(false))?)
 }
 
-/// As [`fixed_colours`], with slides that were read before.
-pub(super) fn colours_of(settings: &Settings, device: &Device, slides: &FirstSlides) -> Result<TransferSettings, RunError> {
-    let plan = Setup::new(with_method(&slides.settled(settings), Method::Reference, Kind::Table))?.plan;
+/// Those of pictures by a method, with slides that were read before.
+pub(super) fn colours_of(settings: &Settings, method: Method, device: &Device, slides: &FirstSlides) -> Result<TransferSettings, RunError> {
+    let plan = Setup::new(with_method(&slides.settled(settings), method, Kind::Table))?.plan;
     fn of<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide) -> Result<TransferSettings, RunError> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         settled_colours(plan, &tracer, slide)

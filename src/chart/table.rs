@@ -25,7 +25,7 @@ pub fn csv(chart: &Chart) -> String {
             number(point.psnr)
         );
     }
-    for curve in chart.pictures.iter().flat_map(|panel| &panel.curves) {
+    for curve in chart.pictures.iter().flat_map(|panel| panel.curves.iter().chain(&panel.map)) {
         for frame in &curve.frames {
             let _ = writeln!(
                 out,

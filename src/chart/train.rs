@@ -8,7 +8,7 @@ use super::still::colours_of;
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device, FrameJob, Interruptible, Rendered, Routing, Surrogate as _, SurrogateRequest};
 use crate::flow::Extras;
-use crate::render::{Film, Renderer, Scene};
+use crate::render::{Film, Method, Renderer, Scene};
 use crate::run::{Decision, RunError, Settings, cpu_batch, suited_network};
 use crate::surrogate::network::SMALLEST_BATCH;
 use crate::surrogate::{Predict, ReplayBuffer, Samples};
@@ -92,7 +92,7 @@ pub fn train(
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
     let slides = FirstSlides::read(settings, 1, stop)?;
     let opened = Opened::new(settings, device, &slides)?;
-    let colours = colours_of(settings, device, &slides)?;
+    let colours = colours_of(settings, Method::Reference, device, &slides)?;
     let mut settings = Settings { transfer: Some(colours), ..slides.settled(settings) };
     let mut decisions = Vec::new();
     if let Some(shape) = opened.shape().filter(|_| device.is_gpu()) {

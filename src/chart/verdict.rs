@@ -137,8 +137,9 @@ fn cheapest<'a>(within: impl Iterator<Item = &'a FtlePoint>) -> Option<String> {
 }
 
 fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
+    said.extend(panel.map.as_ref().map(of_map));
     if panel.curves.is_empty() {
-        said.push("Pictures: not measured.".into());
+        said.push(if panel.map.is_some() { "Pictures of the volume view: not measured.".into() } else { "Pictures: not measured.".into() });
         return;
     }
     for target in TARGETS {
@@ -162,16 +163,26 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
         });
     }
     said.push(of_auto(panel));
-    let sliding = |curve: &super::PictureCurve| {
-        curve.sliding.map(|found| {
-            let psnr = found.psnr.map_or(String::new(), |psnr| format!(" at {psnr:.1} dB"));
-            format!("{} {:.2}/s{psnr}", curve.name(), found.frames_per_second)
-        })
-    };
-    let rates: Vec<String> = panel.curves.iter().filter_map(sliding).collect();
+    let rates: Vec<String> = panel.curves.iter().filter_map(rate).collect();
     if !rates.is_empty() {
         said.push(format!("Frames of a window that slides at every frame: {}.", rates.join(", ")));
     }
+}
+
+/// Frames a second of a window that slides at every frame; `None` if they were not measured.
+fn rate(curve: &PictureCurve) -> Option<String> {
+    let found = curve.sliding?;
+    let psnr = found.psnr.map_or(String::new(), |psnr| format!(" at {psnr:.1} dB"));
+    Some(format!("{} {:.2}/s{psnr}", curve.name(), found.frames_per_second))
+}
+
+/// When the map reaches each target.
+fn of_map(curve: &PictureCurve) -> String {
+    let reached = TARGETS.iter().filter_map(|&target| Some(format!("{target} dB after {}", duration(curve.seconds_to(target)?))));
+    let reached: Vec<String> = reached.collect();
+    let reached = if reached.is_empty() { "no target was reached".to_owned() } else { reached.join(", ") };
+    let sliding = rate(curve).map_or(String::new(), |rate| format!("; of a window that slides at every frame, {rate}"));
+    format!("The map, of which the FTLE of each pixel is compared: {reached}{sliding}.")
 }
 
 /// How far `auto` is from the best curve, which begins with `two_level` and the scene's surrogate, and goes on with the method that wins its race.

@@ -135,7 +135,7 @@ fn pictures_converge_and_the_chart_is_drawn() {
     }
 }
 
-/// What `auto` draws as a map is not said to begin with a method of volumes.
+/// What `auto` draws as a map is not said to begin with a method of volumes, and the map has a curve.
 #[test]
 fn a_flat_scene_is_said_to_be_drawn_as_a_map() {
     let folder = tempfile::tempdir().unwrap();
@@ -144,8 +144,20 @@ fn a_flat_scene_is_said_to_be_drawn_as_a_map() {
     std::fs::write(&scene, keys).unwrap();
     let chart = ["chart", text(&scene), "--device", "cpu", "--only", "pictures", "--seconds", "8", "--out", text(&out)];
     run(&mut ridgewatch(chart)).success();
-    let verdict = json(&out.join("chart.json"))["verdict"].to_string();
+    let chart = json(&out.join("chart.json"));
+    let verdict = chart["verdict"].to_string();
     assert!(verdict.contains("draws this scene as a map") && !verdict.contains("begins with"), "{verdict}");
+    let frames = chart["pictures"]["map"]["frames"].as_array().unwrap();
+    let [first, last] = [&frames[0], &frames[frames.len() - 1]].map(|frame| number(&frame["psnr"]));
+    // Eight seeds more in each frame; two frames are told apart.
+    assert!(frames.len() > 1 && last > first + 3.0, "{first} to {last} dB in {} frames", frames.len());
+    let compared = frames.iter().filter(|frame| number(&frame["psnr"]) < 45.0);
+    let off: Vec<f64> = compared.map(|frame| number(&frame["stated_psnr"]) - number(&frame["psnr"])).collect();
+    assert!(!off.is_empty() && off.iter().all(|decibels| decibels.abs() < 3.0), "stated less true PSNR: {off:?}");
+    assert!(verdict.contains("The map, of which the FTLE of each pixel is compared: 30 dB after "), "{verdict}");
+    let csv = std::fs::read_to_string(out.join("chart.csv")).unwrap();
+    assert_eq!(csv.lines().filter(|line| line.starts_with("picture,\"map\",still,")).count(), frames.len());
+    assert!(std::fs::read_to_string(out.join("chart.svg")).unwrap().contains("map (of its FTLE)"));
 }
 
 /// Of snapshots that are left out the chart says what they were worth.
