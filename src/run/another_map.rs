@@ -1,10 +1,11 @@
 //! Another tau or direction, by a command to a run in progress.
 
-use super::cycle::{Cycle, fixed_steps};
+use super::cycle::Cycle;
 use super::decision::{Decision, enter_colours};
 use super::scene::colours;
 use super::slides::{Slide, Slides};
 use super::steering::Change;
+use super::steps::fixed_steps;
 use super::stop::RunEnd;
 use super::transaction::{transaction, with};
 use super::{RunError, TransferRecord};

@@ -1,8 +1,8 @@
 //! The error of a frame's surrogate on its audit points, and the consequences for trust, size and replay buffer.
 
-use super::cycle::{MAX_RENDER_RESIDUALS, Run};
 use super::frame::gate_decides;
 use super::prepare::every;
+use super::state::{MAX_RENDER_RESIDUALS, Run};
 use super::stop::RunEnd;
 use super::transaction::On;
 use super::{FrameRecord, TrustedError};

@@ -4,7 +4,7 @@ use super::record::CheckpointRecord;
 use crate::backend::{DeviceError, Surrogate};
 use crate::surrogate::{CheckpointError, CheckpointState};
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -182,6 +182,27 @@ impl Checkpoints {
         self.write(CheckpointRecord { frame, copy_seconds, ..CheckpointRecord::default() }, begun, state);
         self.wait()
     }
+}
+
+/// Largest number of checkpoints that are kept aside.
+const MAX_UNFIT: usize = 99;
+
+/// Keeps a checkpoint that does not fit from being replaced by the next one: it may be the work of another run. Returns where it is, in words.
+pub(super) fn set_aside(path: &Path, refused: &CheckpointError) -> String {
+    if !matches!(refused, CheckpointError::Mismatch { .. } | CheckpointError::Io { .. }) {
+        return String::new();
+    }
+    for number in 1..=MAX_UNFIT {
+        let mut aside = path.as_os_str().to_owned();
+        aside.push(if number == 1 { ".unfit".to_owned() } else { format!(".unfit-{number}") });
+        // A link takes the name only if it is free.
+        match std::fs::hard_link(path, &aside).and_then(|()| std::fs::remove_file(path)) {
+            Ok(()) => return format!("; it is now {}", Path::new(&aside).display()),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return format!("; it cannot be set aside: {error}"),
+        }
+    }
+    format!("; it cannot be set aside: {MAX_UNFIT} such files are there")
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use super::TransferRecord;
 use super::another_map::asked;
-use super::cycle::Run;
 use super::decision::Decision;
+use super::state::Run;
 use super::steering::{Command, Range, drawn_by};
 use crate::render::RenderError;
 

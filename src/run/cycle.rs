@@ -4,160 +4,36 @@
 //! trains alternates between picture and training, which takes `training.share` of the device's time while the loss falls. Samples traced for
 //! frame n are compared with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
-use super::budget::FrameCost;
-use super::checkpoints::{CheckpointTotals, Checkpoints};
+use super::checkpoints::set_aside;
 use super::commands::Commands;
-use super::decision::{Decision, enter_colours, suited_network, why_steps};
-use super::frame::LastAudit;
-use super::integration::integration_warnings;
-use super::need::Need;
+use super::decision::Decision;
 use super::prepare::FLOW_MAP;
-use super::race::{Pace, Race, Races};
-use super::record::Frame;
+use super::race::{Pace, Races};
 use super::refine::Frames;
+use super::report::{Event, RunOptions, RunReport, ShownSlide, Sink};
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{LOOK_UP, Slide, Slides};
-use super::steering::{Command, Steering, drawn_by};
-use super::steps::{Comparison, PictureSteps, Shown, is_outdated, picture_steps, suit_the_picture};
+use super::state::{FramePlace, Run, RunGiven};
+use super::steps::{Comparison, PictureSteps, fixed_steps};
 use super::stop::{RunEnd, check_stop};
 use super::storage::begin_with_half;
-use super::training::{Threads, TrainingBudget};
+use super::training::Threads;
 use super::transaction::{On, Recovering, Session, transaction, with};
 use super::until::Refining;
-use super::{ColorBar, RunError, Settings, TransferRecord, snapshots};
+use super::{ColorBar, RunError, TransferRecord, snapshots};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
-use crate::flow::{
-    FlowError, FlowMap, IntegrationDifferences, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, cpu_tracer, time_resolution,
-};
+use crate::flow::{FlowMap, StepChoice, Steps, VelocitySource, time_resolution};
 use crate::progress::{self, Work};
-use crate::render::smooth::AUDIT_PAIRS;
-use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
+use crate::render::{MAX_FRAMES_UNTIL, Method, Target};
 use crate::source::SourceKind;
-use crate::source::live::NextWindow;
-use crate::surrogate::network::{NetworkSettings, Size, Times};
-use crate::surrogate::{
-    CheckpointError, Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace,
-};
-use crate::trust::TrustMap;
-use std::path::{Path, PathBuf};
+use crate::surrogate::Trace;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-/// Options of a run besides its scene.
-#[derive(Debug, Clone, Default)]
-pub struct RunOptions {
-    /// Number of new uniform points on which each frame's stated error is checked afterwards; 0 disables the check.
-    pub verify_points: usize,
-    /// Wall-clock seconds after which no further frame starts.
-    pub seconds: Option<f64>,
-    /// Number of worker threads; 0: as many as the process may use.
-    pub threads: usize,
-    /// File for the trained surrogate, written at the end.
-    pub checkpoint: Option<PathBuf>,
-    /// Seconds between checkpoints during the run. A killed run can resume from the latest one.
-    pub checkpoint_seconds: Option<f64>,
-    /// File with weights to go on from if they fit; otherwise the run begins anew, with a warning. `training.resume` goes before it, and ends the
-    /// run if it does not fit.
-    pub resume_if_fit: Option<PathBuf>,
-    /// The device that computes.
-    pub device: Device,
-    /// Commands to the run; `None`: nobody steers it.
-    pub steering: Option<Arc<Steering>>,
-    /// Setting it abandons the frame in progress. It has an effect once a stop is requested; the run then ends as if the frame had not begun.
-    pub abandon: Arc<AtomicBool>,
-}
-
-/// Events of a run in progress.
-pub enum Event {
-    /// Before the first frame.
-    Begin {
-        /// Number of frames; `None` if unknown.
-        frames: Option<u64>,
-        /// Remarks on the settings and the source.
-        notes: Vec<String>,
-    },
-    /// A remark after [`Event::Begin`].
-    Note(String),
-    /// A finished frame.
-    Frame(Frame),
-    /// Share of the current frame that is rendered.
-    Progress(f32),
-    /// After the first frame of a slide, and of another flow map: what was traced for it.
-    Slide(Box<ShownSlide>),
-}
-
-/// A slide of which a frame is made.
-pub struct ShownSlide {
-    /// The slide.
-    pub slide: Slide,
-    /// The flow map of its frame, with the steps that were chosen.
-    pub map: FlowMap,
-    /// The flow map as the scene and commands ask for it, with the rule for its steps.
-    pub asked: FlowMap,
-    /// True after the slide's first frame.
-    pub is_new: bool,
-    /// The next window of a running simulation; `None` for other sources.
-    pub next: Option<NextWindow>,
-}
-
-/// Summary of a run.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct RunReport {
-    /// Number of frames.
-    pub frames: u64,
-    /// Number of slides.
-    pub slides: u64,
-    /// Slides that the source has, or the scene allows; `None` if that is not known.
-    pub slides_expected: Option<u64>,
-    /// True if the caller stopped the run.
-    pub interrupted: bool,
-    /// True if a command has changed tau, direction, colours or tolerance: races are no longer those of the scene.
-    pub is_steered: bool,
-    /// True if the run ended since its time was up ([`RunOptions::seconds`]).
-    pub time_is_up: bool,
-    /// Seconds spent waiting for input.
-    pub waited: f64,
-    /// Seconds spent on frames and on adding available snapshots to the window.
-    pub worked: f64,
-    /// Optimizer steps.
-    pub train_steps: u64,
-    /// Runge-Kutta steps per path in the last slide; `None` if each path chooses its own steps, or if there was no tracer yet.
-    pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from that of at least twice as many steps; `None` if it is not finite, or if each path chooses its own
-    /// steps (see [`crate::flow::StepChoice`]).
-    pub integration_difference: Option<f64>,
-    /// Difference of the log-stretch in single from that in double precision; `None` in double precision (see [`IntegrationDifferences`]).
-    pub precision_difference: Option<f64>,
-    /// Difference of the log-stretch by central differences from that by the tangent; `None` for other integrators.
-    pub tangent_difference: Option<f64>,
-    /// Optical residual of the steps; `None` unless they were chosen by it.
-    pub integration_residual: Option<f64>,
-    /// Transfer function; `None` if the run ended before it was chosen.
-    pub transfer: Option<TransferRecord>,
-    /// Size of the surrogate, bytes.
-    pub surrogate_bytes: usize,
-    /// What was chosen for settings that the scene leaves open: one entry a setting, the last choice for it.
-    pub decisions: Vec<Decision>,
-    /// The last race of methods; `None` if there was none.
-    pub race: Option<Race>,
-    /// Changes of its size with `size = "auto"`, with reasons; a few dozen at most, since no rejected size is tried twice.
-    pub sizes: Vec<String>,
-    /// Resolution of the snapshots in time; `None` for closed forms.
-    pub time_resolution: Option<TimeResolution>,
-    /// Largest size of the window, bytes.
-    pub window_bytes: usize,
-    /// Totals of the checkpoints; `None` if the run writes none.
-    pub checkpoints: Option<CheckpointTotals>,
-    /// Warnings since the last frame; earlier ones are in the records.
-    pub warnings: Vec<String>,
-}
-
-/// Reason for the nodes of a table of a flat flow.
-const TWO_A_PIXEL: &str = "two a pixel along the longest edge, since the FTLE of a flow of two dimensions folds finer than data";
 /// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
 const COARSE_IN_TIME: f64 = 0.25;
 /// The same share below which a message calls it fine in time: less than the steps of a grid may change the log-stretch.
@@ -166,154 +42,6 @@ const FINE_IN_TIME: f64 = 0.01;
 const FRAMES_WHILE_PAUSED: usize = 32;
 /// Interval at which a run that waits for a command looks for the end, and for the simulation.
 const GLANCE: Duration = Duration::from_millis(2);
-/// Maximum number of residuals of rendered samples that go to the trust map each frame. More would not improve the estimates of their cells.
-pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
-
-/// The receiver of a run's events.
-pub(super) type Sink<'a> = dyn FnMut(Event) + Send + 'a;
-
-/// State of a run on the host, independent of the backend.
-pub(super) struct Run<'a> {
-    pub(super) plan: &'a Plan,
-    pub(super) options: &'a RunOptions,
-    pub(super) threads: Threads,
-    pub(super) stop: &'a AtomicBool,
-    pub(super) began: Instant,
-    pub(super) report: &'a mut RunReport,
-    pub(super) renderer: Renderer,
-    /// The flow map as the scene and commands ask for it; [`Cycle::map`] is what came of it.
-    pub(super) asked: FlowMap,
-    /// `[render]` with the method and the budget that commands set.
-    pub(super) render: RenderSettings,
-    /// The newest budget, also while the method has none.
-    pub(super) budget: Option<f64>,
-    pub(super) transfer: TransferRecord,
-    /// A command set the range of the colours.
-    pub(super) has_range: bool,
-    pub(super) color_bar: Arc<ColorBar>,
-    pub(super) learning: Learning,
-    pub(super) progress: RunProgress,
-    /// `None` if the run writes no checkpoints.
-    pub(super) checkpoints: Option<Checkpoints>,
-    /// `None` if the method is given.
-    pub(super) races: Option<Races>,
-}
-
-/// State of learning, apart from the surrogate itself.
-pub(super) struct Learning {
-    pub(super) trust: TrustMap,
-    pub(super) buffer: ReplayBuffer,
-    /// Times that are inputs of the network, and the start time of the buffer's labels.
-    pub(super) times: Times,
-    pub(super) start: f64,
-    /// Settings of the surrogate, with the nodes of the data if a table has no others.
-    pub(super) settings: SurrogateSettings,
-    /// Settings of the network, with sizes that suit the window where the scene leaves them open.
-    pub(super) network: NetworkSettings,
-    /// Reason for the nodes of a table of a new window.
-    pub(super) why_nodes: String,
-    /// Search for the size, with `size = "auto"`.
-    pub(super) sizing: Option<Sizing>,
-    /// Size for the next frame; `None` to keep the present one.
-    pub(super) resize: Option<Resize>,
-    /// Device time due to training beside a live simulation.
-    pub(super) budget: TrainingBudget,
-    /// How much training is needed.
-    pub(super) need: Need,
-    /// Training after the last frame went out, or in a frame that failed. It goes into the next record.
-    pub(super) unreported: Learned,
-    /// Largest log-stretch on the audit points of this slide.
-    pub(super) peak: f32,
-}
-
-impl Learning {
-    /// Adds training to the next record.
-    pub(super) fn report(&mut self, learned: Learned) {
-        self.unreported = std::mem::take(&mut self.unreported).and(learned);
-    }
-
-    /// Training since the last frame; `None` if nothing was trained.
-    pub(super) fn unreported_since_last_frame(&mut self) -> Option<Learned> {
-        Some(std::mem::take(&mut self.unreported)).filter(|learned| *learned != Learned::default())
-    }
-}
-
-/// Progress of a run, and the contents of its next record.
-#[derive(Default)]
-pub(super) struct RunProgress {
-    pub(super) frame: u64,
-    /// Number of frames without the warm-up frames.
-    pub(super) pictures: u64,
-    /// Points traced since the last frame to prepare the next one.
-    pub(super) preparation_traces: u64,
-    /// True once the warning about short particle lifetimes was given.
-    pub(super) has_warned_of_deaths: bool,
-    /// True once the warning about few audit points was given.
-    pub(super) has_warned_of_few_points: bool,
-    pub(super) warnings: Vec<String>,
-    /// Optimizer steps of the surrogate that the accumulating picture shows.
-    pub(super) steps_shown: u64,
-    /// Seconds that smooth frames take; `None` before the first one.
-    pub(super) cost: Option<FrameCost>,
-    /// Seconds that the loop paused since the last frame for a checkpoint.
-    pub(super) checkpoint_pause: f64,
-    /// Commands that took effect since the last frame.
-    pub(super) commands: Vec<Command>,
-    /// Seconds that the run waited for a step and looked for commands, since the last frame.
-    pub(super) waited: f64,
-    /// True if the device had no room for a finer table in this slide.
-    pub(super) lacks_room_for_nodes: bool,
-    /// Seconds of building the surrogate, or of moving it to the window, when that was last done.
-    pub(super) surrogate_seconds: f64,
-    /// Seconds of races since the last frame.
-    pub(super) raced: f64,
-    /// The latest audit of the present window and surrogate.
-    pub(super) last_audit: Option<LastAudit>,
-}
-
-impl RunProgress {
-    /// Forgets that commands asked for another tau or direction, since it could not be had.
-    pub(super) fn take_back_map(&mut self) {
-        for command in &mut self.commands {
-            (command.set.tau, command.set.direction) = (None, None);
-        }
-        self.commands.retain(|command| !command.set.is_empty());
-    }
-
-    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows, of which a part may have gone to a
-    /// finer table. The first frame of many is the march, with the samples that measure its error, and the next two make up for it.
-    pub(super) fn affordable_samples(&self, settings: &RenderSettings, place: &FramePlace) -> f64 {
-        /// Samples a pixel of the first frame with a budget, whose cost is not known.
-        const FIRST: f64 = 0.25;
-        /// Those that measure the error of a march.
-        const SOON: f64 = 2.0 * AUDIT_PAIRS;
-        let Some(milliseconds) = settings.budget else {
-            return match place.after.filter(|_| settings.method == Method::TwoLevel && settings.samples > SOON) {
-                Some(0) => SOON,
-                Some(1) => settings.samples - SOON,
-                // A target is met by as many as it needs.
-                Some(2) if settings.until.is_none() => 2.0 * settings.samples,
-                _ => settings.samples,
-            };
-        };
-        let affordable = self.cost.map_or(FIRST, |cost| cost.samples(1e-3 * milliseconds, place.refining));
-        // An even sixteenth at least, so that every tile gets samples.
-        affordable.clamp(1.0 / 16.0, 4096.0)
-    }
-}
-
-impl Recovering for Run<'_> {
-    fn warn(&mut self, warning: String) {
-        self.progress.warnings.push(warning);
-    }
-    fn pool(&self) -> &rayon::ThreadPool {
-        self.threads.render()
-    }
-    fn stop(&self) -> &AtomicBool {
-        self.stop
-    }
-}
-
 /// A run and the session that computes.
 pub(super) struct Cycle<'a, B: Backend> {
     pub(super) run: Run<'a>,
@@ -330,18 +58,6 @@ pub(super) struct Cycle<'a, B: Backend> {
 
 /// Frames of a slide from which on the first one is drawn soon, with few samples.
 const SOON_FROM: usize = 8;
-
-/// Place of a frame in its slide.
-#[derive(Clone, Copy)]
-pub(super) struct FramePlace {
-    pub(super) is_warmup: bool,
-    /// Seconds of preparing the slide, for its first frame; 0 for the others.
-    pub(super) preparing: f64,
-    /// Seconds of tracing nodes of a finer table before the frame.
-    pub(super) refining: f64,
-    /// Frames that its slide has had, if enough are expected for the first to be drawn soon; `None` with a budget or after a command.
-    pub(super) after: Option<usize>,
-}
 
 /// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame, which setting `options.abandon` ends
 /// early. Between frames (while the window fills, tables are traced, or cells are probed) the run ends within about a second.
@@ -451,17 +167,6 @@ fn drive<B: Backend>(
     }
 }
 
-/// What a run is given before its first slide.
-struct RunGiven<'a> {
-    plan: &'a Plan,
-    options: &'a RunOptions,
-    threads: Threads,
-    stop: &'a AtomicBool,
-    began: Instant,
-    earlier_race: Option<Race>,
-    report: &'a mut RunReport,
-}
-
 /// State that a recovery needs before [`Run`] exists.
 struct Beginning<'a> {
     threads: &'a Threads,
@@ -499,190 +204,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
     Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None, picture: Default::default() }))
 }
 
-impl<'a> Run<'a> {
-    fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, is_gpu: bool, first: &Slide) -> Result<Self, RunEnd> {
-        let RunGiven { plan, options, threads, stop, began, earlier_race, report } = frame;
-        let scene = &plan.scene;
-        let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
-        let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
-        let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
-        let color_bar = Arc::new(ColorBar::new(&renderer, scene.render.method, [range.0, range.1], &plan.time_unit));
-        let pixels = [scene.render.width, scene.render.height];
-        let for_picture = scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain);
-        let mut because = "256 along the longest edge, or 128 below a network".to_owned();
-        if for_picture.table_nodes.is_some() {
-            because = TWO_A_PIXEL.to_owned();
-        }
-        let settings = match &first.velocity {
-            VelocitySource::Window(window) => {
-                let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
-                let most = if first.live.is_some() { max_live_nodes(scene, &options.device).min(own) } else { own };
-                window.grid().map(|grid| {
-                    let [x, y, z] = grid.shape();
-                    let [fine_x, fine_y, _] = for_picture.table_nodes.unwrap_or_default();
-                    let wanted = [x.max(fine_x), y.max(fine_y), z];
-                    because = match (fine_x > x, fine_y > y) {
-                        (true, true) => TWO_A_PIXEL.to_owned(),
-                        (false, false) => "those of the data".to_owned(),
-                        _ => format!("those of the data, or {TWO_A_PIXEL}"),
-                    };
-                    if wanted.iter().product::<usize>() > most {
-                        because += &format!(", in proportion down to {most} in all");
-                    }
-                    scene.surrogate.at_resolution_of(wanted, most)
-                })
-            }
-            VelocitySource::Analytic(..) => None,
-        };
-        let settings = settings.unwrap_or(for_picture);
-        let sized = scene.render.method.has_surrogate() && scene.network.size == Size::Auto;
-        let learns = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Table;
-        let network = match &first.velocity {
-            VelocitySource::Window(window) if learns && is_gpu => {
-                window.grid().map(|grid| suited_network(&scene.network, grid.shape(), &mut report.decisions))
-            }
-            _ => None,
-        };
-        let network = network.unwrap_or_else(|| scene.network.clone());
-        let sizing = sized.then(|| Sizing::new(&settings, &network, &plan.domain)).transpose()?;
-        let times = Times::new(&scene.network, flow.tau());
-        let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
-        if !scene.network.inputs.is_empty() {
-            buffer.set_now(times.unit(flow.start(), flow.tau()));
-        }
-        let has_table = scene.render.method.has_surrogate() && scene.surrogate.kind != Kind::Network;
-        if has_table && scene.surrogate.table_nodes.is_none() && scene.network.size != Size::Auto {
-            let nodes = settings.nodes(&plan.domain)?;
-            let bytes = nodes.iter().product::<usize>() * size_of::<f32>();
-            Decision::new("surrogate.table_nodes", format_args!("{nodes:?}"), format_args!("{because}; {:.2} MB", bytes as f64 / 1e6))
-                .enter(&mut report.decisions);
-        }
-        enter_colours(&plan.scene, scene.render.method, transfer, &mut report.decisions);
-        report.transfer = Some(transfer);
-        report.integration_steps = fixed_steps(flow);
-        let learning = Learning {
-            trust: TrustMap::new(&scene.trust, &plan.domain),
-            buffer,
-            times,
-            start: flow.start(),
-            settings,
-            network,
-            why_nodes: because,
-            sizing,
-            resize: None,
-            budget: TrainingBudget::new(scene.training.share),
-            need: Need::default(),
-            unreported: Learned::default(),
-            peak: f32::NEG_INFINITY,
-        };
-        let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
-        let races = plan.races.then(|| Races::new(earlier_race.as_ref()));
-        let mut render = scene.render.clone();
-        if let Some(race) = earlier_race.filter(|_| plan.races) {
-            Decision::new("render.method", race.method.name(), format_args!("{}, in an earlier run", race.why()))
-                .enter(&mut report.decisions);
-            render = drawn_by(&render, race.method, render.budget);
-            options.steering.iter().for_each(|steering| steering.keep_method(race.method));
-        }
-        if !render.method.has_surrogate() {
-            Decision::withdraw_surrogate(&mut report.decisions);
-        }
-        let progress = RunProgress::default();
-        Ok(Self {
-            plan,
-            options,
-            threads,
-            stop,
-            began,
-            report,
-            renderer,
-            asked: plan.map.clone(),
-            budget: render.budget,
-            render,
-            transfer,
-            has_range: false,
-            color_bar,
-            learning,
-            progress,
-            checkpoints,
-            races,
-        })
-    }
-}
-
 impl<B: Backend> Cycle<'_, B> {
-    /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer, and by one of a window in single precision,
-    /// if the picture needs it.
-    pub(super) fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
-        let shown = self.run.shown();
-        let Some(chosen) = chosen.filter(|_| suit_the_picture(shown.plan)) else { return Ok(()) };
-        let (settled, compared) = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
-        self.compared = compared;
-        self.settled = Some((chosen, settled));
-        if settled.steps < chosen.steps {
-            tracing::info!("{settled:?} instead of {chosen:?}");
-            self.take_steps(chosen, Some(settled));
-            transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
-        }
-        self.tell_snapshots(slide, chosen)?;
-        self.settle_storage(slide, true)?;
-        Ok(())
-    }
-
-    /// Chooses the steps anew if they do not suit the picture of this slide. Returns whether the flow map is another one.
-    pub(super) fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
-        let Some((chosen, settled)) = self.settled else { return Ok(false) };
-        let (shown, begin) = (self.run.shown(), Instant::now());
-        let (anew, compared) = self.run.threads.render().install(|| {
-            let (is_outdated, compared) = is_outdated(shown, slide, chosen, settled)?;
-            if !is_outdated {
-                return Ok((None, compared));
-            }
-            match cpu_tracer(slide.velocity.clone(), shown.map, slide.time) {
-                Ok(tracer) => {
-                    let anew = tracer.step_choice().unwrap_or(chosen);
-                    let (settled, compared) = picture_steps(shown, slide, anew)?;
-                    Ok((Some(Ok((anew, settled))), compared))
-                }
-                // The run goes on with what it has.
-                Err(error @ FlowError::StepsNotFound { .. }) => Ok((Some(Err(error)), compared)),
-                Err(error) => Err(RunEnd::from(error)),
-            }
-        })?;
-        self.compared = compared;
-        tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
-        let (chosen, settled) = match anew {
-            None => return Ok(false),
-            Some(Ok(anew)) => anew,
-            Some(Err(error)) => {
-                self.run.progress.warnings.push(format!("slide {}: {error}; the picture keeps {} steps", slide.index, settled.steps));
-                return Ok(false);
-            }
-        };
-        if !chosen.within_tolerance {
-            self.run.progress.warnings.push(format!(
-                "slide {}: the log-stretch (FTLE times tau) with {} steps differs by {:.3} from that with twice as many",
-                slide.index, chosen.steps, chosen.difference
-            ));
-        }
-        tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
-        let before = self.map.steps;
-        self.settled = Some((chosen, settled));
-        self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
-        Ok(self.map.steps != before)
-    }
-
-    /// Takes the steps of the picture, or else those of the log-stretch.
-    pub(super) fn take_steps(&mut self, chosen: StepChoice, settled: Option<PictureSteps>) {
-        let (steps, difference) = settled.map_or((chosen.steps, chosen.difference), |settled| (settled.steps, settled.difference));
-        self.map.steps = Steps::Fixed(steps);
-        let report = &mut self.run.report;
-        report.integration_steps = Some(steps);
-        report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
-        report.integration_residual = settled.map(|settled| settled.residual);
-        Decision::new("flow.steps", steps, why_steps(difference, report.integration_residual)).enter(&mut report.decisions);
-    }
-
     /// Renders all slides. The preparation of the first one began at `begun`.
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         self.prepare_first(&mut slide, sink)?;
@@ -967,16 +489,6 @@ impl<B: Backend> Cycle<'_, B> {
 }
 
 impl Run<'_> {
-    pub(super) fn shown(&self) -> Shown<'_> {
-        Shown {
-            plan: self.plan,
-            map: &self.asked,
-            transfer: self.renderer.transfer(),
-            tolerance: self.learning.trust.tolerance(),
-            stop: self.stop,
-        }
-    }
-
     /// Ends the run if that was asked for, or its time is up.
     fn check_end(&self) -> Result<(), RunEnd> {
         progress::mark();
@@ -1008,68 +520,4 @@ impl Run<'_> {
         }
         Ok(())
     }
-
-    /// Warnings about a flow map whose steps were `chosen` or given.
-    pub(super) fn flow_warnings(
-        &self,
-        flow: &dyn Tracer,
-        chosen: Option<StepChoice>,
-        differences: Option<IntegrationDifferences>,
-    ) -> Vec<String> {
-        let mut warnings: Vec<String> = self.colourless(flow).into_iter().collect();
-        if let Some(found) = &differences {
-            warnings.extend(integration_warnings(found, &self.plan.map, flow.steps(), chosen.is_some()));
-        }
-        if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
-            warnings.push(format!(
-                "{} of {} paths of the step choice have no finite log-stretch (FTLE times tau): the integration overflowed there",
-                chosen.not_finite,
-                StepChoice::POINTS
-            ));
-        }
-        if let Some(chosen) = chosen.filter(|chosen| !chosen.within_tolerance) {
-            warnings.push(format!(
-                "{} steps a path, the maximum, still differ from twice as many by {:.3} in the log-stretch (FTLE times tau), root mean \
-                 square of the better 98 %",
-                chosen.steps, chosen.difference
-            ));
-        }
-        warnings
-    }
-}
-
-/// Largest number of checkpoints that are kept aside.
-const MAX_UNFIT: usize = 99;
-
-/// Keeps a checkpoint that does not fit from being replaced by the next one: it may be the work of another run. Returns where it is, in words.
-fn set_aside(path: &Path, refused: &CheckpointError) -> String {
-    if !matches!(refused, CheckpointError::Mismatch { .. } | CheckpointError::Io { .. }) {
-        return String::new();
-    }
-    for number in 1..=MAX_UNFIT {
-        let mut aside = path.as_os_str().to_owned();
-        aside.push(if number == 1 { ".unfit".to_owned() } else { format!(".unfit-{number}") });
-        // A link takes the name only if it is free.
-        match std::fs::hard_link(path, &aside).and_then(|()| std::fs::remove_file(path)) {
-            Ok(()) => return format!("; it is now {}", Path::new(&aside).display()),
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(error) => return format!("; it cannot be set aside: {error}"),
-        }
-    }
-    format!("; it cannot be set aside: {MAX_UNFIT} such files are there")
-}
-
-/// Maximum number of table nodes for a live simulation, since every slide traces the table again. On the CPU it is the number of camera paths of
-/// the slide's frames: with more nodes, the table costs more than tracing every query.
-fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
-    if device.is_gpu() {
-        return usize::MAX;
-    }
-    let frames = [scene.render.width, scene.render.height, scene.render.samples.ceil() as usize, scene.time.frames_per_slide];
-    frames.into_iter().fold(1, usize::saturating_mul)
-}
-
-/// Steps per path; `None` if each path chooses its own.
-pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
-    Some(tracer.steps()).filter(|steps| *steps > 0)
 }

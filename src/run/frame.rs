@@ -3,12 +3,14 @@
 use super::assess::{Work, assess};
 use super::budget::FrameCost;
 use super::checkpoints::Checkpoints;
-use super::cycle::{Event, FramePlace, Learning, Run, Sink, fixed_steps};
 use super::decision::cpu_batch;
 use super::doubts::short_lived;
 use super::record::{DomainRecord, Frame};
+use super::report::{Event, Sink};
 use super::setup::Plan;
 use super::slides::{Slide, Slides};
+use super::state::{FramePlace, Learning, Run};
+use super::steps::fixed_steps;
 use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};

@@ -3,9 +3,10 @@
 use super::cycle::Cycle;
 use super::setup::auto_steps;
 use super::slides::Slide;
+use super::state::Run;
 use super::stop::{RunEnd, check_stop};
 use crate::backend::Backend;
-use crate::flow::{FlowMap, IntegrationDifferences, StepChoice, Steps, VelocitySource, integration_differences};
+use crate::flow::{FlowMap, IntegrationDifferences, StepChoice, Steps, Tracer, VelocitySource, integration_differences};
 
 impl<B: Backend> Cycle<'_, B> {
     /// Measures the differences of the flow map, for the report. `chosen`: how its steps were, if they were not given.
@@ -30,6 +31,36 @@ impl<B: Backend> Cycle<'_, B> {
         report.precision_difference = finite(|found| found.precision);
         report.tangent_difference = finite(|found| found.tangent);
         Ok(found)
+    }
+}
+
+impl Run<'_> {
+    /// Warnings about a flow map whose steps were `chosen` or given.
+    pub(super) fn flow_warnings(
+        &self,
+        flow: &dyn Tracer,
+        chosen: Option<StepChoice>,
+        differences: Option<IntegrationDifferences>,
+    ) -> Vec<String> {
+        let mut warnings: Vec<String> = self.colourless(flow).into_iter().collect();
+        if let Some(found) = &differences {
+            warnings.extend(integration_warnings(found, &self.plan.map, flow.steps(), chosen.is_some()));
+        }
+        if let Some(chosen) = chosen.filter(|chosen| chosen.not_finite > 0) {
+            warnings.push(format!(
+                "{} of {} paths of the step choice have no finite log-stretch (FTLE times tau): the integration overflowed there",
+                chosen.not_finite,
+                StepChoice::POINTS
+            ));
+        }
+        if let Some(chosen) = chosen.filter(|chosen| !chosen.within_tolerance) {
+            warnings.push(format!(
+                "{} steps a path, the maximum, still differ from twice as many by {:.3} in the log-stretch (FTLE times tau), root mean \
+                 square of the better 98 %",
+                chosen.steps, chosen.difference
+            ));
+        }
+        warnings
     }
 }
 

@@ -1,9 +1,9 @@
 //! Preparation of a slide before its frames: surrogate, tables, probes and the pilot picture.
 
 use super::TransferRecord;
-use super::cycle::{MAX_RENDER_RESIDUALS, Run};
 use super::doubts::{beyond_colours, uniform_ftle};
 use super::slides::Slide;
+use super::state::{MAX_RENDER_RESIDUALS, Run};
 use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present};
 use crate::backend::{

@@ -4,9 +4,11 @@
 //! pictures that are not shown. A race is run as soon as it takes at most a tenth of the time since the one before, and again when the character of the
 //! window has changed.
 
-use super::cycle::{Cycle, Run, Sink};
+use super::cycle::Cycle;
 use super::decision::Decision;
+use super::report::Sink;
 use super::slides::{Slide, Slides};
+use super::state::Run;
 use super::steering::drawn_by;
 use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present, with};

@@ -5,9 +5,10 @@
 //! follow from counts of nodes, samples and frames, not from a clock, so that a run can be repeated; with a budget, whose samples follow the
 //! clock as well, from the time that a traced point takes.
 
-use super::cycle::{Cycle, Run};
+use super::cycle::Cycle;
 use super::decision::Decision;
 use super::slides::Slide;
+use super::state::Run;
 use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present, transaction, with};
 use crate::backend::{Backend, Surrogate};

@@ -1,9 +1,13 @@
 //! Runge-Kutta steps of a smooth picture: as few as its colours do not tell from more.
 
+use super::cycle::Cycle;
+use super::decision::{Decision, why_steps};
 use super::setup::Plan;
 use super::slides::Slide;
+use super::state::Run;
 use super::stop::{RunEnd, check_stop};
-use crate::backend::stratified_points;
+use super::transaction::{transaction, with};
+use crate::backend::{Backend, stratified_points};
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
 use crate::progress::{self, Work};
@@ -11,6 +15,7 @@ use crate::render::Transfer;
 use crate::trust::Strata;
 use std::ops::RangeInclusive;
 use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
 /// Largest optical residual of the steps, as a part of `trust.tolerance`, in flows of three dimensions, whose errors average along a ray: pictures of
 /// turbulence differ by 57 dB then (`docs/accuracy.md`).
@@ -166,6 +171,98 @@ impl Comparison {
             _ => 1.0,
         }))
     }
+}
+
+impl Run<'_> {
+    /// What the picture shows of the flow that is asked for.
+    pub(super) fn shown(&self) -> Shown<'_> {
+        Shown {
+            plan: self.plan,
+            map: &self.asked,
+            transfer: self.renderer.transfer(),
+            tolerance: self.learning.trust.tolerance(),
+            stop: self.stop,
+        }
+    }
+}
+
+impl<B: Backend> Cycle<'_, B> {
+    /// Replaces the flow map of the first slide by one with the steps of the picture, if these are fewer, and by one of a window in single precision,
+    /// if the picture needs it.
+    pub(super) fn settle_steps(&mut self, slide: &Slide, chosen: Option<StepChoice>) -> Result<(), RunEnd> {
+        let shown = self.run.shown();
+        let Some(chosen) = chosen.filter(|_| suit_the_picture(shown.plan)) else { return Ok(()) };
+        let (settled, compared) = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
+        self.compared = compared;
+        self.settled = Some((chosen, settled));
+        if settled.steps < chosen.steps {
+            tracing::info!("{settled:?} instead of {chosen:?}");
+            self.take_steps(chosen, Some(settled));
+            transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        }
+        self.tell_snapshots(slide, chosen)?;
+        self.settle_storage(slide, true)?;
+        Ok(())
+    }
+
+    /// Chooses the steps anew if they do not suit the picture of this slide. Returns whether the flow map is another one.
+    pub(super) fn look_at_steps(&mut self, slide: &Slide) -> Result<bool, RunEnd> {
+        let Some((chosen, settled)) = self.settled else { return Ok(false) };
+        let (shown, begin) = (self.run.shown(), Instant::now());
+        let (anew, compared) = self.run.threads.render().install(|| {
+            let (is_outdated, compared) = is_outdated(shown, slide, chosen, settled)?;
+            if !is_outdated {
+                return Ok((None, compared));
+            }
+            match cpu_tracer(slide.velocity.clone(), shown.map, slide.time) {
+                Ok(tracer) => {
+                    let anew = tracer.step_choice().unwrap_or(chosen);
+                    let (settled, compared) = picture_steps(shown, slide, anew)?;
+                    Ok((Some(Ok((anew, settled))), compared))
+                }
+                // The run goes on with what it has.
+                Err(error @ FlowError::StepsNotFound { .. }) => Ok((Some(Err(error)), compared)),
+                Err(error) => Err(RunEnd::from(error)),
+            }
+        })?;
+        self.compared = compared;
+        tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
+        let (chosen, settled) = match anew {
+            None => return Ok(false),
+            Some(Ok(anew)) => anew,
+            Some(Err(error)) => {
+                self.run.progress.warnings.push(format!("slide {}: {error}; the picture keeps {} steps", slide.index, settled.steps));
+                return Ok(false);
+            }
+        };
+        if !chosen.within_tolerance {
+            self.run.progress.warnings.push(format!(
+                "slide {}: the log-stretch (FTLE times tau) with {} steps differs by {:.3} from that with twice as many",
+                slide.index, chosen.steps, chosen.difference
+            ));
+        }
+        tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
+        let before = self.map.steps;
+        self.settled = Some((chosen, settled));
+        self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
+        Ok(self.map.steps != before)
+    }
+
+    /// Takes the steps of the picture, or else those of the log-stretch.
+    pub(super) fn take_steps(&mut self, chosen: StepChoice, settled: Option<PictureSteps>) {
+        let (steps, difference) = settled.map_or((chosen.steps, chosen.difference), |settled| (settled.steps, settled.difference));
+        self.map.steps = Steps::Fixed(steps);
+        let report = &mut self.run.report;
+        report.integration_steps = Some(steps);
+        report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
+        report.integration_residual = settled.map(|settled| settled.residual);
+        Decision::new("flow.steps", steps, why_steps(difference, report.integration_residual)).enter(&mut report.decisions);
+    }
+}
+
+/// Steps per path; `None` if each path chooses its own.
+pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+    Some(tracer.steps()).filter(|steps| *steps > 0)
 }
 
 /// Root mean square, from the mean square and its standard error added up: few points hold most of a difference.
