@@ -213,6 +213,7 @@ fn refine_on_cpu(
         sum: smooth.sum,
         samples: frame.samples,
         budget: smooth.budget,
+        steps_error: smooth.steps_error,
         number: frame.picture,
         stop: frame.stop,
     };

@@ -250,6 +250,9 @@ pub struct Smooth {
     pub traced_nodes: usize,
     /// Seconds that the frame should take, if they are limited. On the CPU marching keeps to them over the frames; on a device it takes milliseconds.
     pub budget: Option<f64>,
+    /// Mean square error of the Runge-Kutta steps over lit pixels, in the weightings of [`TileErrors`](ridgewatch_render::smooth::TileErrors), which the
+    /// picture states too; 0: not measured.
+    pub steps_error: [f64; 3],
 }
 
 /// A rendered frame.

@@ -254,7 +254,8 @@ impl MapPicture {
                 of.scatter = of.scatter.map(f32::sqrt);
             }
         });
-        let error = PictureError { unbiased: true, ..PictureError::of(&tiles, &MarchError::default(), 2.0 * self.seeds as f64, 0) };
+        let error =
+            PictureError { unbiased: true, ..PictureError::of(&tiles, &MarchError::default(), [0.0; 3], 2.0 * self.seeds as f64, 0) };
         let floor = if error.is_known() { (ERROR_FLOOR * error.rms.value.powi(2) * (high - low).powi(2)) as f32 } else { 0.0 };
         // Without a value there is no error of it.
         film.error = (smoothed(&variances, width, ERROR_RADIUS).into_par_iter().zip(&film.ftle_mean))

@@ -60,7 +60,7 @@ impl<B: Backend> Cycle<'_, B> {
         if let Some(steps) = with!(&self.session, on => fixed_steps(on.tracer().flow())) {
             self.map.steps = Steps::Fixed(steps);
         }
-        self.settled = None;
+        (self.settled, self.run.steps_error) = (None, None);
         let report = &mut self.run.report;
         (report.integration_difference, report.integration_residual) = (None, None);
         report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));

@@ -230,7 +230,14 @@ impl Run<'_> {
         let samples = if method == Method::Marched { 1.0 } else { samples_per_pixel };
         let traced_nodes = if gate_decides(method, surrogate) { (a_sample as f64 * samples) as usize } else { 0 };
         let budget = self.render.budget.map(|milliseconds| 1e-3 * milliseconds);
-        Ok(Some(Smooth { method, sum: self.plan.scene.render.combine == Combine::Sum, nodes, traced_nodes, budget }))
+        Ok(Some(Smooth {
+            method,
+            sum: self.plan.scene.render.combine == Combine::Sum,
+            nodes,
+            traced_nodes,
+            budget,
+            steps_error: self.steps_error.unwrap_or_default(),
+        }))
     }
 
     /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame

@@ -47,6 +47,8 @@ pub(super) struct Run<'a> {
     /// The newest budget, also while the method has none.
     pub(super) budget: Option<f64>,
     pub(super) transfer: TransferRecord,
+    /// Mean square error that the steps leave in smooth pictures, in the weightings of [`crate::render::smooth::TileErrors`]; `None`: not measured.
+    pub(super) steps_error: Option<[f64; 3]>,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
     pub(super) color_bar: Arc<ColorBar>,
@@ -297,6 +299,7 @@ impl<'a> Run<'a> {
             budget: render.budget,
             render,
             transfer,
+            steps_error: None,
             has_range: false,
             color_bar,
             learning,

@@ -11,7 +11,7 @@ use crate::backend::{Backend, stratified_points};
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
 use crate::progress::{self, Work};
-use crate::render::Transfer;
+use crate::render::{RayPoints, Renderer, Target};
 use crate::trust::Strata;
 use std::ops::RangeInclusive;
 use std::sync::atomic::AtomicBool;
@@ -22,6 +22,14 @@ use std::time::Instant;
 const SHARE: f64 = 2.0 / 3.0;
 /// The same in two dimensions, where a ray sees one value: a residual of 0.007 left a picture 40 dB.
 const FLAT_SHARE: f64 = 1.0 / 15.0;
+/// Largest root mean square difference in the tone-mapped picture from that of the steps that the log-stretch asks for, as a part of `trust.tolerance` (46 dB
+/// by default), and its largest share of the mean square of a target (10 dB below it). Residuals of one sign, as where paths end at a coast or an edge, do not
+/// average along a ray.
+const PICTURE: f64 = 1.0 / 6.0;
+const TARGET_SHARE: f64 = 0.1;
+/// Rays, and points on each of two nets of every ray, by which pictures are compared.
+const RAYS: usize = 384;
+const PER_RAY: usize = 12;
 /// Smallest share of the points on which something is to be seen.
 const MIN_SHOWN: f64 = 1.0 / 32.0;
 /// The residual at which steps are chosen again on a later slide, in units of the largest one of a choice: at more, pictures suffer, and at less,
@@ -36,7 +44,7 @@ pub(super) struct Shown<'a> {
     pub(super) plan: &'a Plan,
     /// The flow map as it is asked for.
     pub(super) map: &'a FlowMap,
-    pub(super) transfer: &'a Transfer,
+    pub(super) renderer: &'a Renderer,
     /// Allowed optical residual of the picture.
     pub(super) tolerance: f64,
     pub(super) stop: &'a AtomicBool,
@@ -48,6 +56,18 @@ impl Shown<'_> {
         self.tolerance * if self.plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
     }
 
+    /// True if steps that leave these mean square errors in the picture are enough. What was not measured is not asked for.
+    fn suits(&self, picture: Option<[f64; 3]>) -> bool {
+        picture.is_none_or(|[_, relative, toned]| {
+            let of_target = match self.plan.scene.render.until {
+                Some(Target::Psnr(decibels)) => toned <= TARGET_SHARE * 10f64.powf(-0.1 * decibels),
+                Some(Target::Relmse(most)) => relative <= TARGET_SHARE * most,
+                None => true,
+            };
+            toned <= (PICTURE * self.tolerance).powi(2) && of_target
+        })
+    }
+
     /// In double precision, as the steps of the log-stretch are chosen.
     fn tracer(&self, slide: &Slide, steps: usize) -> Result<Box<dyn Tracer>, FlowError> {
         let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..self.map.clone() };
@@ -55,7 +75,7 @@ impl Shown<'_> {
     }
 
     fn ramp(&self, log_stretch: f32) -> f64 {
-        f64::from(self.transfer.ramp(log_stretch / self.map.tau as f32))
+        f64::from(self.renderer.transfer().ramp(log_stretch / self.map.tau as f32))
     }
 }
 
@@ -67,10 +87,13 @@ pub(super) struct PictureSteps {
     pub(super) difference: f64,
     /// Optical residual: difference of the ramp of the transfer function.
     pub(super) residual: f64,
+    /// Mean square difference of the picture from that of the steps that the log-stretch asks for, in the weightings of
+    /// [`crate::render::smooth::TileErrors`]; `None`: these are the steps, or it was not measured.
+    pub(super) picture: Option<[f64; 3]>,
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
-/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance, or those `chosen` for the log-stretch if it has none below them, if these are not within their own
+/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance and whose error in the picture is small enough, or those `chosen` for the log-stretch if it has none below them, if these are not within their own
 /// tolerance, or if too few points show anything to judge by (and there is no comparison).
 ///
 /// # Errors
@@ -79,16 +102,19 @@ pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice)
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
     let work = Work::begin("choosing the steps of the picture");
     let Some(mut comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
-        return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0 }, None));
+        return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0, picture: None }, None));
     };
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
         // Where it ends is not known.
         work.stands(format!("{} of at most {} a path", multiple * chosen.multiple_of, chosen.steps));
-        let found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
+        let mut found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
         comparison.of_steps = found.residual;
         if found.residual <= shown.most() {
-            return Ok((found, Some(comparison)));
+            found.picture = comparison.in_picture(shown, slide, [found.steps, chosen.steps])?;
+            if shown.suits(found.picture) {
+                return Ok((found, Some(comparison)));
+            }
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
     }
@@ -131,6 +157,8 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
 pub(super) struct Comparison {
     pub(super) points: Vec<DomainPoint>,
     truth: Traced,
+    /// Points on rays of the picture and their log-stretch with the steps that it asks for, once pictures are compared.
+    rays: Option<(RayPoints, Vec<f32>)>,
     /// Optical residual of the steps that the picture takes, in double precision too.
     pub(super) of_steps: f64,
 }
@@ -147,7 +175,7 @@ impl Comparison {
         reference.trace(&points, Extras::default(), &mut truth);
         let seen = truth.log_stretch.iter().filter(|&&s| shown.ramp(s) > 0.0).count();
         let cells: usize = cells.iter().product();
-        Ok(Some(Self { points, truth, of_steps: 0.0 }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
+        Ok(Some(Self { points, truth, rays: None, of_steps: 0.0 }).filter(|_| seen as f64 >= MIN_SHOWN * cells as f64))
     }
 
     /// How far `steps` steps through this slide are from the truth.
@@ -158,7 +186,21 @@ impl Comparison {
         shown.tracer(slide, steps)?.trace(&self.points, Extras::default(), &mut traced);
         let pairs = traced.log_stretch.iter().zip(&self.truth.log_stretch);
         let difference = upper_rms(pairs.map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
-        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced) })
+        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced), picture: None })
+    }
+
+    /// Mean square difference between the pictures of `few` and of `many` steps; `None` if hardly anything is lit.
+    fn in_picture(&mut self, shown: Shown<'_>, slide: &Slide, [few, many]: [usize; 2]) -> Result<Option<[f64; 3]>, RunEnd> {
+        let (rays, truth) = match &mut self.rays {
+            Some(rays) => rays,
+            rays => {
+                let points = shown.renderer.ray_points(RAYS, PER_RAY);
+                let truth = along_rays(shown, slide, &points, many)?;
+                rays.insert((points, truth))
+            }
+        };
+        let found = along_rays(shown, slide, rays, few)?;
+        Ok(shown.renderer.pictures_apart(rays, &found, truth))
     }
 
     /// Optical residual of what was traced at the points.
@@ -176,13 +218,7 @@ impl Comparison {
 impl Run<'_> {
     /// What the picture shows of the flow that is asked for.
     pub(super) fn shown(&self) -> Shown<'_> {
-        Shown {
-            plan: self.plan,
-            map: &self.asked,
-            transfer: self.renderer.transfer(),
-            tolerance: self.learning.trust.tolerance(),
-            stop: self.stop,
-        }
+        Shown { plan: self.plan, map: &self.asked, renderer: &self.renderer, tolerance: self.learning.trust.tolerance(), stop: self.stop }
     }
 }
 
@@ -195,6 +231,7 @@ impl<B: Backend> Cycle<'_, B> {
         let (settled, compared) = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
         self.compared = compared;
         self.settled = Some((chosen, settled));
+        self.run.steps_error = settled.picture;
         if settled.steps < chosen.steps {
             tracing::info!("{settled:?} instead of {chosen:?}");
             self.take_steps(chosen, Some(settled));
@@ -225,10 +262,16 @@ impl<B: Backend> Cycle<'_, B> {
                 Err(error) => Err(RunEnd::from(error)),
             }
         })?;
+        let residual = compared.as_ref().map(|compared| compared.of_steps);
         self.compared = compared;
         tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
         let (chosen, settled) = match anew {
-            None => return Ok(false),
+            None => {
+                // What the picture loses goes with the square of what points do.
+                let share = residual.filter(|_| settled.residual > 0.0).map_or(1.0, |residual| (residual / settled.residual).powi(2));
+                self.run.steps_error = settled.picture.map(|squared| squared.map(|of| share * of));
+                return Ok(false);
+            }
             Some(Ok(anew)) => anew,
             Some(Err(error)) => {
                 self.run.progress.warnings.push(format!("slide {}: {error}; the picture keeps {} steps", slide.index, settled.steps));
@@ -244,6 +287,7 @@ impl<B: Backend> Cycle<'_, B> {
         tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
         let before = self.map.steps;
         self.settled = Some((chosen, settled));
+        self.run.steps_error = settled.picture;
         self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
         Ok(self.map.steps != before)
     }
@@ -263,6 +307,19 @@ impl<B: Backend> Cycle<'_, B> {
 /// Steps per path; `None` if each path chooses its own.
 pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
     Some(tracer.steps()).filter(|steps| *steps > 0)
+}
+
+/// Log-stretch at points of rays; NaN in missing cells.
+fn along_rays(shown: Shown<'_>, slide: &Slide, rays: &RayPoints, steps: usize) -> Result<Vec<f32>, RunEnd> {
+    check_stop(shown.stop)?;
+    progress::mark();
+    let tracer = shown.tracer(slide, steps)?;
+    let is_known: Vec<bool> = rays.points.iter().map(|&point| !tracer.is_missing(point)).collect();
+    let known: Vec<DomainPoint> = rays.points.iter().zip(&is_known).filter_map(|(&point, known)| known.then_some(point)).collect();
+    let mut traced = Traced::default();
+    tracer.trace(&known, Extras::default(), &mut traced);
+    let mut found = traced.log_stretch.iter().copied();
+    Ok(is_known.into_iter().map(|known| if known { found.next().unwrap_or(f32::NAN) } else { f32::NAN }).collect())
 }
 
 /// Root mean square, from the mean square and its standard error added up: few points hold most of a difference.

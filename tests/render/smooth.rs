@@ -94,7 +94,8 @@ impl Smooth {
         (method, sum, samples): (Method, bool, f64),
         of: impl Fn(DomainPoint) -> f32,
     ) -> (Film, PictureError) {
-        let round = Refinement { nodes, missing, method, sum, samples, budget: None, number: self.rounds, stop: &NEVER };
+        let round =
+            Refinement { nodes, missing, method, sum, samples, budget: None, steps_error: [0.0; 3], number: self.rounds, stop: &NEVER };
         self.rounds += 1;
         let (film, _, error) = self.renderer.refine(&mut self.picture, &round, &mut Traced(of)).unwrap();
         (film, error)

@@ -65,6 +65,41 @@ fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
     }
 }
 
+/// Where paths end at an edge, fewer steps shorten all of them: the picture keeps an error that no sample shows, and states it.
+#[test]
+fn the_picture_states_what_fewer_steps_leave_in_it() {
+    let keys = "domain.min = [0, 0, 0]\ndomain.max = [6.283, 6.283, 6.283]\nflow.boundary = \"stop\"\ntime.tau = 4\ntime.slides = 1\nsurrogate.kind = \"table\"";
+    let frame = |method: &str, samples: usize, others: &[&str]| {
+        let text = scene::scene("abc", [48, 32, samples], &format!("{keys}\nrender.method = \"{method}\""));
+        let mut found = None;
+        let report = scene::run_frames(scene::setup(&text, others), &RunOptions::default(), |frame| {
+            found.get_or_insert(frame);
+        });
+        (found.unwrap(), report)
+    };
+    let (first, report) = frame("two_level", 4, &[]);
+    let stated = first.record.picture_error.unwrap();
+    let transfer = report.transfer.unwrap();
+    let colours = [format!("transfer.low={}", transfer.low), format!("transfer.high={}", transfer.high)];
+    // The same random numbers, and the steps of either.
+    let film = |steps: Option<usize>| {
+        let steps = steps.map(|steps| format!("flow.steps={steps}"));
+        let others: Vec<&str> = colours.iter().chain(&steps).map(String::as_str).collect();
+        frame("reference", 512, &others).0.film
+    };
+    let [few, many] = [report.integration_steps, None].map(film);
+    let lit: Vec<usize> = (0..many.rgba.len()).filter(|&pixel| many.rgba[pixel][3] > 0.01).collect();
+    let square = |&pixel: &usize| (0..3).map(|k| f64::from(few.rgba[pixel][k] - many.rgba[pixel][k]).powi(2)).sum::<f64>() / 3.0;
+    let rms = (lit.iter().map(square).sum::<f64>() / lit.len() as f64).sqrt();
+    println!("{:?} steps: {rms}, stated {} of {}", report.integration_steps, stated.steps_rms, stated.rms.value);
+    assert!((0.5..=2.0).contains(&(stated.steps_rms / rms)), "{rms}, stated {}", stated.steps_rms);
+    assert!(stated.rms.value >= stated.steps_rms && stated.rms.low >= stated.steps_rms, "{stated:?}");
+    // Steps that the scene gives, or the log-stretch asks for, are those of the field.
+    for given in ["flow.steps=40", "flow.tolerance=0.01"] {
+        assert_eq!(frame("two_level", 4, &[given]).0.record.picture_error.unwrap().steps_rms, 0.0, "{given}");
+    }
+}
+
 /// Slides of a double gyre that turns at another speed in each.
 pub struct Gusts {
     pub first: Slide,

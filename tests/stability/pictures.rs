@@ -167,6 +167,7 @@ fn marching_too_coarse() {
                 sum: false,
                 samples: 2.0,
                 budget: None,
+                steps_error: [0.0; 3],
                 number,
                 stop: &NEVER,
             };
@@ -263,7 +264,17 @@ fn true_square(film: &Film, [a, b]: &[Film; 2]) -> f64 {
 
 /// A round of `two_level` with this many samples a pixel.
 fn corrected(nodes: &Nodes, samples: f64) -> Refinement<'_> {
-    Refinement { nodes, missing: None, method: Method::TwoLevel, sum: false, samples, budget: None, number: 0, stop: &NEVER }
+    Refinement {
+        nodes,
+        missing: None,
+        method: Method::TwoLevel,
+        sum: false,
+        samples,
+        budget: None,
+        steps_error: [0.0; 3],
+        number: 0,
+        stop: &NEVER,
+    }
 }
 
 /// Fails without the floor of half the standard error.

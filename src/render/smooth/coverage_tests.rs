@@ -96,7 +96,17 @@ fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Metho
         let mut last = None;
         for number in 0..rounds {
             let samples = 2.0 * pairs_per_pixel;
-            let round = Refinement { nodes: surrogate, missing: None, method, sum, samples, budget: None, number, stop: &NEVER };
+            let round = Refinement {
+                nodes: surrogate,
+                missing: None,
+                method,
+                sum,
+                samples,
+                budget: None,
+                steps_error: [0.0; 3],
+                number,
+                stop: &NEVER,
+            };
             last = renderer.refine(&mut picture, &round, &mut Traced(traced));
         }
         let (film, _, error) = last.unwrap();
@@ -153,6 +163,7 @@ fn errors_of_pixels_hold() {
                         sum: false,
                         samples: 1.0,
                         budget: None,
+                        steps_error: [0.0; 3],
                         number,
                         stop: &NEVER,
                     };
@@ -193,6 +204,7 @@ fn a_target_is_reached_when_it_is_met() {
                 sum: false,
                 samples: 1.0,
                 budget: None,
+                steps_error: [0.0; 3],
                 number,
                 stop: &NEVER,
             };
@@ -228,6 +240,7 @@ fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
             sum: true,
             samples: 1.0,
             budget: None,
+            steps_error: [0.0; 3],
             number,
             stop: &NEVER,
         };
@@ -260,8 +273,17 @@ fn a_shrunk_correction_converges_with_its_samples() {
         let error_of = |number: i32| {
             let all = 4_f64.powi(number);
             let (method, samples) = (Method::TwoLevel, if number > 0 { 0.75 * all } else { all });
-            let round =
-                Refinement { nodes: &surrogate, missing: None, method, sum, samples, budget: None, number: number as u64, stop: &NEVER };
+            let round = Refinement {
+                nodes: &surrogate,
+                missing: None,
+                method,
+                sum,
+                samples,
+                budget: None,
+                steps_error: [0.0; 3],
+                number: number as u64,
+                stop: &NEVER,
+            };
             let (film, _, stated) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
             assert!((stated.samples_per_pixel / all - 1.0).abs() < 0.05, "{} samples, not {all}", stated.samples_per_pixel);
             true_square(&film, &exact, |_| 1.0).sqrt()

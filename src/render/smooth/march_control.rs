@@ -53,14 +53,14 @@ pub struct AuditedPixel {
 }
 
 impl AuditedPixel {
-    /// Errors are stated over lit pixels, so that others do not count.
+    /// The march is made finer for errors over lit pixels alone.
     pub fn is_lit(&self) -> bool {
         self.shown[3] > f64::from(LIT)
     }
 }
 
 /// Mean over the channels of a product, in the weightings of [`super::TileErrors`] of a pixel that shows `shown` where `truth` is right.
-fn weighted(a: [f64; 3], b: [f64; 3], tone_map: ToneMap, shown: [f64; 3], truth: [f64; 3]) -> [f64; 3] {
+pub(crate) fn weighted(a: [f64; 3], b: [f64; 3], tone_map: ToneMap, shown: [f64; 3], truth: [f64; 3]) -> [f64; 3] {
     let mut sums = [0.0; 3];
     for k in 0..3 {
         let (product, slope) = (a[k] * b[k] / 3.0, f64::from(tone_map.secant(shown[k] as f32, truth[k] as f32)));
@@ -123,6 +123,8 @@ pub struct MarchControl {
     steps: Mean,
     light: Mean,
     both: Mean,
+    /// Squared error of the pixel filter where nothing is lit.
+    unlit: Mean,
 }
 
 /// What to do after a round.
@@ -138,7 +140,7 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        let [filter, steps, light, both] = [Mean::default(); 4];
+        let [filter, steps, light, both, unlit] = [Mean::default(); 5];
         Self {
             rays: 0,
             next_rays: MIN_RAYS,
@@ -150,6 +152,7 @@ impl Default for MarchControl {
             steps,
             light,
             both,
+            unlit,
         }
     }
 }
@@ -206,13 +209,18 @@ impl MarchControl {
     /// Takes in audited pixels and what all of them show now. `tone_map` is that of the picture.
     pub fn audit(&mut self, pixels: impl IntoIterator<Item = AuditedPixel>, tone_map: ToneMap) {
         self.audited.extend(pixels);
-        [self.filter, self.steps, self.light, self.both] = [Mean::default(); 4];
+        [self.filter, self.steps, self.light, self.both, self.unlit] = [Mean::default(); 5];
         let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);
-        for pixel in self.audited.iter().filter(|pixel| pixel.is_lit()) {
+        for pixel in &self.audited {
             let [red, green, blue, _] = pixel.shown;
             let (shown, [one, other]) = ([red, green, blue], pixel.nets);
             let truth = std::array::from_fn(|k| 0.5 * (one[k] + other[k]));
-            self.filter.add(weighted(minus(shown, one), minus(shown, other), tone_map, shown, truth));
+            let filter = weighted(minus(shown, one), minus(shown, other), tone_map, shown, truth);
+            if !pixel.is_lit() {
+                self.unlit.add(filter);
+                continue;
+            }
+            self.filter.add(filter);
             let (pair, fine, steps) = (pixel.pair, pixel.fine, minus(pixel.pair, pixel.fine));
             self.steps.add(weighted(steps, steps, tone_map, pair, fine));
             if let Some(lit) = pixel.lit {
@@ -241,7 +249,7 @@ impl MarchControl {
             (self.steps.deviation(w) + self.light.deviation(w) + both).hypot(self.filter.deviation(w))
         };
         let squared = std::array::from_fn(|w| self.quadrature(w) + self.filter.value(w));
-        MarchError { squared, deviation: std::array::from_fn(deviation) }
+        MarchError { squared, deviation: std::array::from_fn(deviation), unlit: [self.unlit.value(2), self.unlit.deviation(2)] }
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.

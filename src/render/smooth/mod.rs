@@ -23,6 +23,7 @@ pub use combine::{Combined, Correction, PairSums, combine, smoothed};
 pub use coupled::{CoupledPath, coupled_paths};
 pub use light_volume::{LightGrid, LightVolume, MARGIN};
 pub use march::{RaySum, ToLight};
+pub(crate) use march_control::weighted;
 pub use medium::{IsMissing, Medium, node_spacing};
 pub use nodes::{BRICK, Nodes, brick_shape, own_nodes};
 pub use picture::{Picture, Refinement};

@@ -28,23 +28,30 @@ impl ErrorEstimate {
     }
 }
 
-/// Mean square error of marching over lit pixels and channels, in the weightings of [`TileErrors`].
+/// Mean square error of marching over channels, in the weightings of [`TileErrors`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct MarchError {
-    /// Mean over audited pixels.
+    /// Mean over audited lit pixels.
     pub squared: [f64; 3],
     /// Its standard error.
     pub deviation: [f64; 3],
+    /// Mean and standard error of that of the pixel filter over the audited pixels that are not lit, tone-mapped: at the edges of missing cells and of the box.
+    pub unlit: [f64; 2],
 }
 
 impl MarchError {
-    /// Adds the error of marching, `share` of that of the lit pixels, to another mean square error. Its own interval reaches two standard errors from its
-    /// mean.
-    fn added_to(&self, other: ErrorEstimate, weighting: usize, share: f64) -> ErrorEstimate {
-        let [squared, deviation] = [self.squared, self.deviation].map(|of| share * of[weighting]);
-        let value = other.value + squared;
-        let (below, above) = ((other.value - other.low).hypot(2.0 * deviation), (other.high - other.value).hypot(2.0 * deviation));
-        ErrorEstimate { value, low: (value - below).max(0.0), high: value + above }
+    /// Adds the error of marching over lit pixels to another mean square error.
+    fn added_to(&self, other: ErrorEstimate, weighting: usize) -> ErrorEstimate {
+        other.plus([self.squared[weighting], self.deviation[weighting]])
+    }
+}
+
+impl ErrorEstimate {
+    /// Adds an independent mean square error, of which the mean and its standard error are given. Its own interval reaches two of these from the mean.
+    fn plus(self, [squared, deviation]: [f64; 2]) -> Self {
+        let value = self.value + squared;
+        let (below, above) = ((self.value - self.low).hypot(2.0 * deviation), (self.high - self.value).hypot(2.0 * deviation));
+        Self { value, low: (value - below).max(0.0), high: value + above }
     }
 }
 
@@ -62,6 +69,9 @@ pub struct PictureError {
     pub psnr_all: ErrorEstimate,
     /// Root mean square of the error of marching alone, linear radiance. It is part of the errors above.
     pub march_rms: f64,
+    /// Root mean square of the error of the Runge-Kutta steps alone, linear radiance. It is part of the errors above; 0 where it was not measured.
+    #[serde(default)]
+    pub steps_rms: f64,
     /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"` on the CPU. The FTLE of a map is unbiased.
     pub unbiased: bool,
     /// Coupled samples per pixel since the picture started anew.
@@ -147,13 +157,17 @@ impl PictureError {
         [self.rms, self.relmse, self.psnr, self.psnr_all].iter().all(|e| e.value.is_finite() && e.low.is_finite() && e.high.is_finite())
     }
 
-    /// Error of a picture from its tiles and the error of its march.
-    pub fn of(tiles: &[TileSums], march: &MarchError, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
-        let lit = |weighting: usize| march.added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting, 1.0);
+    /// Error of a picture from its tiles, the error of its march, and the mean square error of its Runge-Kutta steps over lit pixels, in the weightings of
+    /// [`TileErrors`]; 0: not measured.
+    pub fn of(tiles: &[TileSums], march: &MarchError, steps: [f64; 3], samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
+        let lit = |weighting: usize| {
+            march.added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting).plus([steps[weighting], 0.0])
+        };
         let pixels = |of: fn(&TileSums) -> f32| tiles.iter().map(|tile| f64::from(of(tile))).sum::<f64>();
-        // Pixels that are not lit have hardly any of it.
         let share_lit = pixels(|tile| tile.lit.pixels) / pixels(|tile| tile.all.pixels).max(1.0);
-        let all = march.added_to(estimate(tiles.iter().map(|tile| &tile.all), 2), 2, share_lit);
+        let of_lit = [march.squared[2] + steps[2], march.deviation[2]].map(|of| share_lit * of);
+        let of_unlit = march.unlit.map(|of| (1.0 - share_lit) * of);
+        let all = estimate(tiles.iter().map(|tile| &tile.all), 2).plus(of_lit).plus(of_unlit);
         let decibels = |e: ErrorEstimate| {
             let e = e.map(|mse| -10.0 * mse.max(1e-12).log10());
             ErrorEstimate { value: e.value, low: e.high, high: e.low }
@@ -164,6 +178,7 @@ impl PictureError {
             psnr: decibels(lit(2)),
             psnr_all: decibels(all),
             march_rms: march.squared[0].sqrt(),
+            steps_rms: steps[0].sqrt(),
             unbiased: false,
             samples_per_pixel,
             rays_per_pixel,
@@ -301,15 +316,43 @@ mod tests {
 
     #[test]
     fn the_error_of_marching_counts_in_its_own_weighting() {
-        let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: [1.0, 2.0, 0.5] };
+        let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: [1.0, 2.0, 0.5], ..MarchError::default() };
         let none = ErrorEstimate::default();
-        let found = [0, 1, 2].map(|weighting| march.added_to(none, weighting, 1.0));
+        let found = [0, 1, 2].map(|weighting| march.added_to(none, weighting));
         let interval = |value, low, high| ErrorEstimate { value, low, high };
         assert_eq!(found, [interval(4.0, 2.0, 6.0), interval(8.0, 4.0, 12.0), interval(2.0, 1.0, 3.0)]);
         // Independent errors: half-widths are added in squares.
         let other = ErrorEstimate { value: 10.0, low: 8.5, high: 10.0 };
-        assert_eq!(march.added_to(other, 0, 1.0), interval(14.0, 11.5, 16.0));
-        assert_eq!(march.added_to(other, 0, 0.0), other);
+        assert_eq!(march.added_to(other, 0), interval(14.0, 11.5, 16.0));
+        assert_eq!(other.plus([0.0; 2]), other);
+    }
+
+    #[test]
+    fn the_error_of_steps_adds_to_all_that_is_stated() {
+        let of = |steps: [f64; 3]| PictureError::of(&tiles_of(&[4e-4; 64], 1e-4), &MarchError::default(), steps, 1.0, 4);
+        let (error, found) = (of([0.0; 3]), of([5e-4, 2e-3, 3e-4]));
+        let square = |decibels: f64| 10f64.powf(-0.1 * decibels);
+        for (before, after) in [(error.rms.value, found.rms.value), (error.rms.low, found.rms.low), (error.rms.high, found.rms.high)] {
+            assert!((after * after - before * before - 5e-4).abs() < 1e-12, "{error:?} {found:?}");
+        }
+        for (before, after) in [(error.psnr.value, found.psnr.value), (error.psnr.low, found.psnr.low), (error.psnr.high, found.psnr.high)]
+        {
+            assert!((square(after) - square(before) - 3e-4).abs() < 1e-12, "{error:?} {found:?}");
+        }
+        assert!((found.relmse.value - error.relmse.value - 2e-3).abs() < 1e-12);
+        // Half of the pixels are lit.
+        assert!((square(found.psnr_all.value) - square(error.psnr_all.value) - 1.5e-4).abs() < 1e-12);
+        assert_eq!((found.steps_rms, found.march_rms), (5e-4_f64.sqrt(), error.march_rms));
+    }
+
+    /// Half of the pixels are lit.
+    #[test]
+    fn all_pixels_have_the_march_of_their_own_kind() {
+        let march = MarchError { squared: [0.0, 0.0, 2e-4], unlit: [6e-4, 0.0], ..MarchError::default() };
+        let found = PictureError::of(&tiles_of(&[0.0; 4], 0.0), &march, [0.0; 3], 1.0, 4);
+        assert!((found.psnr.value + 10.0 * 2e-4_f64.log10()).abs() < 1e-6, "{found:?}");
+        // The pixels themselves err by 1e-6 where they are not lit.
+        assert!((found.psnr_all.value + 10.0 * (4e-4_f64 + 0.5e-6).log10()).abs() < 1e-6, "{found:?}");
     }
 
     /// Tiles of 256 pixels, half of them lit: mean square errors of the lit pixels, and deviation of the noise of their mean.
