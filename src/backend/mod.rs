@@ -28,7 +28,7 @@ pub use settings::{DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLos
 
 use ridgewatch_field::Domain;
 use ridgewatch_flow::{FlowError, FlowMap, VelocitySource};
-use ridgewatch_render::smooth::PictureError;
+use ridgewatch_render::smooth::{PictureError, StepsError};
 use ridgewatch_render::{Film, Method, RenderStats, Renderer};
 use ridgewatch_source::Listener;
 use ridgewatch_surrogate::network::NetworkSettings;
@@ -250,9 +250,8 @@ pub struct Smooth {
     pub traced_nodes: usize,
     /// Seconds that the frame should take, if they are limited. On the CPU marching keeps to them over the frames; on a device it takes milliseconds.
     pub budget: Option<f64>,
-    /// Mean square error of the Runge-Kutta steps over lit pixels, in the weightings of [`TileErrors`](ridgewatch_render::smooth::TileErrors), which the
-    /// picture states too; 0: not measured.
-    pub steps_error: [f64; 3],
+    /// Error of the Runge-Kutta steps, which the picture states too.
+    pub steps_error: StepsError,
 }
 
 /// A rendered frame.

@@ -4,7 +4,7 @@
 //! the other. Seeds accumulate while the view stands still; other colours need none.
 
 use super::renderer::{RenderStats, Renderer};
-use super::smooth::{MarchError, PictureError, TILE, TileSums, smoothed};
+use super::smooth::{MarchError, PictureError, StepsError, TILE, TileSums, smoothed};
 use super::{CameraSettings, Film, LogStretch, MapPlane};
 use rayon::prelude::*;
 use ridgewatch_field::DomainPoint;
@@ -254,8 +254,10 @@ impl MapPicture {
                 of.scatter = of.scatter.map(f32::sqrt);
             }
         });
-        let error =
-            PictureError { unbiased: true, ..PictureError::of(&tiles, &MarchError::default(), [0.0; 3], 2.0 * self.seeds as f64, 0) };
+        let error = PictureError {
+            unbiased: true,
+            ..PictureError::of(&tiles, &MarchError::default(), &StepsError::default(), 2.0 * self.seeds as f64, 0)
+        };
         let floor = if error.is_known() { (ERROR_FLOOR * error.rms.value.powi(2) * (high - low).powi(2)) as f32 } else { 0.0 };
         // Without a value there is no error of it.
         film.error = (smoothed(&variances, width, ERROR_RADIUS).into_par_iter().zip(&film.ftle_mean))

@@ -136,6 +136,11 @@ impl Renderer {
         &self.scene
     }
 
+    /// True if the flow has two dimensions.
+    pub(super) fn is_flat(&self) -> bool {
+        self.domain.dimensions == 2
+    }
+
     /// The current transfer function.
     pub fn transfer(&self) -> &Transfer {
         &self.transfer

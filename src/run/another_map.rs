@@ -11,6 +11,7 @@ use super::transaction::{transaction, with};
 use super::{RunError, TransferRecord};
 use crate::backend::Backend;
 use crate::flow::{FlowMap, Steps, VelocitySource, time_resolution};
+use crate::render::smooth::StepsError;
 use crate::render::{Renderer, Scene, TransferSettings};
 use crate::surrogate::network::Times;
 use crate::surrogate::{ReplayBuffer, Sizing, Trace};
@@ -60,7 +61,7 @@ impl<B: Backend> Cycle<'_, B> {
         if let Some(steps) = with!(&self.session, on => fixed_steps(on.tracer().flow())) {
             self.map.steps = Steps::Fixed(steps);
         }
-        (self.settled, self.run.steps_error) = (None, None);
+        (self.settled, self.run.steps_error) = (None, StepsError::default());
         let report = &mut self.run.report;
         (report.integration_difference, report.integration_residual) = (None, None);
         report.integration_steps = with!(&self.session, on => fixed_steps(on.tracer().flow()));

@@ -236,7 +236,7 @@ impl Run<'_> {
             nodes,
             traced_nodes,
             budget,
-            steps_error: self.steps_error.unwrap_or_default(),
+            steps_error: self.steps_error,
         }))
     }
 

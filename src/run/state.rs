@@ -17,7 +17,7 @@ use super::transaction::Recovering;
 use super::{ColorBar, Settings, TransferRecord};
 use crate::backend::Device;
 use crate::flow::{FlowMap, Tracer, VelocitySource};
-use crate::render::smooth::AUDIT_PAIRS;
+use crate::render::smooth::{AUDIT_PAIRS, StepsError};
 use crate::render::{Method, RenderSettings, Renderer, Scene};
 use crate::surrogate::network::{NetworkSettings, Size, Times};
 use crate::surrogate::{Kind, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings};
@@ -47,8 +47,8 @@ pub(super) struct Run<'a> {
     /// The newest budget, also while the method has none.
     pub(super) budget: Option<f64>,
     pub(super) transfer: TransferRecord,
-    /// Mean square error that the steps leave in smooth pictures, in the weightings of [`crate::render::smooth::TileErrors`]; `None`: not measured.
-    pub(super) steps_error: Option<[f64; 3]>,
+    /// What the steps leave in smooth pictures.
+    pub(super) steps_error: StepsError,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
     pub(super) color_bar: Arc<ColorBar>,
@@ -299,7 +299,7 @@ impl<'a> Run<'a> {
             budget: render.budget,
             render,
             transfer,
-            steps_error: None,
+            steps_error: StepsError::default(),
             has_range: false,
             color_bar,
             learning,

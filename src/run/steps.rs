@@ -11,6 +11,7 @@ use crate::backend::{Backend, stratified_points};
 use crate::field::DomainPoint;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, Tracer, cpu_tracer};
 use crate::progress::{self, Work};
+use crate::render::smooth::StepsError;
 use crate::render::{RayPoints, Renderer, Target};
 use crate::trust::Strata;
 use std::ops::RangeInclusive;
@@ -27,9 +28,10 @@ const FLAT_SHARE: f64 = 1.0 / 15.0;
 /// average along a ray.
 const PICTURE: f64 = 1.0 / 6.0;
 const TARGET_SHARE: f64 = 0.1;
-/// Rays, and points on each of two nets of every ray, by which pictures are compared.
-const RAYS: usize = 384;
-const PER_RAY: usize = 12;
+/// Pixels by which pictures are compared at first, and most if these do not tell; points of each of the two nets of a pixel.
+const PIXELS: usize = 512;
+const MOST_PIXELS: usize = 4 * PIXELS;
+const PER_NET: usize = 12;
 /// Smallest share of the points on which something is to be seen.
 const MIN_SHOWN: f64 = 1.0 / 32.0;
 /// The residual at which steps are chosen again on a later slide, in units of the largest one of a choice: at more, pictures suffer, and at less,
@@ -56,16 +58,21 @@ impl Shown<'_> {
         self.tolerance * if self.plan.domain.dimensions == 3 { SHARE } else { FLAT_SHARE }
     }
 
-    /// True if steps that leave these mean square errors in the picture are enough. What was not measured is not asked for.
-    fn suits(&self, picture: Option<[f64; 3]>) -> bool {
-        picture.is_none_or(|[_, relative, toned]| {
-            let of_target = match self.plan.scene.render.until {
-                Some(Target::Psnr(decibels)) => toned <= TARGET_SHARE * 10f64.powf(-0.1 * decibels),
-                Some(Target::Relmse(most)) => relative <= TARGET_SHARE * most,
-                None => true,
-            };
-            toned <= (PICTURE * self.tolerance).powi(2) && of_target
-        })
+    /// Whether steps that leave this error in the picture are few enough; `None`: its standard error leaves that open.
+    fn suits(&self, picture: &StepsError) -> Option<bool> {
+        let [relative, toned] = [1, 2].map(|w| [picture.squared[w] - picture.deviation[w], picture.squared[w] + picture.deviation[w]]);
+        let of_target = match self.plan.scene.render.until {
+            Some(Target::Psnr(decibels)) => Some((toned, TARGET_SHARE * 10f64.powf(-0.1 * decibels))),
+            Some(Target::Relmse(most)) => Some((relative, TARGET_SHARE * most)),
+            None => None,
+        };
+        let of_tolerance = (toned, (PICTURE * self.tolerance).powi(2));
+        let all = || of_target.into_iter().chain([of_tolerance]);
+        match (all().any(|([low, _], most)| low > most), all().all(|([_, high], most)| high <= most)) {
+            (true, _) => Some(false),
+            (_, true) => Some(true),
+            _ => None,
+        }
     }
 
     /// In double precision, as the steps of the log-stretch are chosen.
@@ -87,9 +94,8 @@ pub(super) struct PictureSteps {
     pub(super) difference: f64,
     /// Optical residual: difference of the ramp of the transfer function.
     pub(super) residual: f64,
-    /// Mean square difference of the picture from that of the steps that the log-stretch asks for, in the weightings of
-    /// [`crate::render::smooth::TileErrors`]; `None`: these are the steps, or it was not measured.
-    pub(super) picture: Option<[f64; 3]>,
+    /// How far the picture is from that of the steps that the log-stretch asks for; 0: these are the steps, or it was not measured.
+    pub(super) picture: StepsError,
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
@@ -102,7 +108,10 @@ pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice)
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
     let work = Work::begin("choosing the steps of the picture");
     let Some(mut comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
-        return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0, picture: None }, None));
+        return Ok((
+            PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0, picture: StepsError::default() },
+            None,
+        ));
     };
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
@@ -111,8 +120,9 @@ pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice)
         let mut found = comparison.of(shown, slide, multiple * chosen.multiple_of)?;
         comparison.of_steps = found.residual;
         if found.residual <= shown.most() {
-            found.picture = comparison.in_picture(shown, slide, [found.steps, chosen.steps])?;
-            if shown.suits(found.picture) {
+            let (picture, suits) = comparison.in_picture(shown, slide, [found.steps, chosen.steps])?;
+            if suits {
+                found.picture = picture;
                 return Ok((found, Some(comparison)));
             }
         }
@@ -157,10 +167,17 @@ pub(super) fn suit_the_picture(plan: &Plan) -> bool {
 pub(super) struct Comparison {
     pub(super) points: Vec<DomainPoint>,
     truth: Traced,
-    /// Points on rays of the picture and their log-stretch with the steps that it asks for, once pictures are compared.
-    rays: Option<(RayPoints, Vec<f32>)>,
+    /// Rays of the picture, once pictures are compared.
+    rays: Option<Rays>,
     /// Optical residual of the steps that the picture takes, in double precision too.
     pub(super) of_steps: f64,
+}
+
+/// Rays through `count` pixels: points on them, and their log-stretch with the steps that it asks for.
+struct Rays {
+    points: RayPoints,
+    truth: Vec<f32>,
+    count: usize,
 }
 
 impl Comparison {
@@ -186,21 +203,28 @@ impl Comparison {
         shown.tracer(slide, steps)?.trace(&self.points, Extras::default(), &mut traced);
         let pairs = traced.log_stretch.iter().zip(&self.truth.log_stretch);
         let difference = upper_rms(pairs.map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
-        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced), picture: None })
+        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced), picture: StepsError::default() })
     }
 
-    /// Mean square difference between the pictures of `few` and of `many` steps; `None` if hardly anything is lit.
-    fn in_picture(&mut self, shown: Shown<'_>, slide: &Slide, [few, many]: [usize; 2]) -> Result<Option<[f64; 3]>, RunEnd> {
-        let (rays, truth) = match &mut self.rays {
-            Some(rays) => rays,
-            rays => {
-                let points = shown.renderer.ray_points(RAYS, PER_RAY);
-                let truth = along_rays(shown, slide, &points, many)?;
-                rays.insert((points, truth))
+    /// Mean square difference between the pictures of `few` and of `many` steps, and whether it is small enough; 0 if hardly anything is lit.
+    fn in_picture(&mut self, shown: Shown<'_>, slide: &Slide, [few, many]: [usize; 2]) -> Result<(StepsError, bool), RunEnd> {
+        let mut count = PIXELS;
+        loop {
+            if self.rays.as_ref().is_none_or(|rays| rays.count < count) {
+                let points = shown.renderer.ray_points(count, PER_NET);
+                self.rays = Some(Rays { truth: along_rays(shown, slide, &points, many)?, points, count });
             }
-        };
-        let found = along_rays(shown, slide, rays, few)?;
-        Ok(shown.renderer.pictures_apart(rays, &found, truth))
+            let Some(Rays { points, truth, count: known }) = &self.rays else { continue };
+            let found = along_rays(shown, slide, points, few)?;
+            let Some(found) = shown.renderer.pictures_apart(points, &found, truth) else { return Ok((StepsError::default(), true)) };
+            match shown.suits(&found) {
+                Some(suits) => return Ok((found, suits)),
+                None if *known >= MOST_PIXELS => {
+                    return Ok((found, shown.suits(&StepsError { deviation: [0.0; 3], ..found }) == Some(true)));
+                }
+                None => count = 4 * known,
+            }
+        }
     }
 
     /// Optical residual of what was traced at the points.
@@ -269,7 +293,9 @@ impl<B: Backend> Cycle<'_, B> {
             None => {
                 // What the picture loses goes with the square of what points do.
                 let share = residual.filter(|_| settled.residual > 0.0).map_or(1.0, |residual| (residual / settled.residual).powi(2));
-                self.run.steps_error = settled.picture.map(|squared| squared.map(|of| share * of));
+                let StepsError { squared, deviation } = settled.picture;
+                let [squared, deviation] = [squared, deviation].map(|of| of.map(|of| share * of));
+                self.run.steps_error = StepsError { squared, deviation };
                 return Ok(false);
             }
             Some(Ok(anew)) => anew,

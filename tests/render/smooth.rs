@@ -5,7 +5,7 @@ use ridgewatch::chart::most_wrong;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::flow::{FlowMap, VelocitySource, cpu_tracer};
-use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, RaySum, Refinement, ToLight};
+use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, RaySum, Refinement, StepsError, ToLight};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{Kind, Predict, SurrogateSettings, build};
@@ -94,8 +94,17 @@ impl Smooth {
         (method, sum, samples): (Method, bool, f64),
         of: impl Fn(DomainPoint) -> f32,
     ) -> (Film, PictureError) {
-        let round =
-            Refinement { nodes, missing, method, sum, samples, budget: None, steps_error: [0.0; 3], number: self.rounds, stop: &NEVER };
+        let round = Refinement {
+            nodes,
+            missing,
+            method,
+            sum,
+            samples,
+            budget: None,
+            steps_error: StepsError::default(),
+            number: self.rounds,
+            stop: &NEVER,
+        };
         self.rounds += 1;
         let (film, _, error) = self.renderer.refine(&mut self.picture, &round, &mut Traced(of)).unwrap();
         (film, error)

@@ -3,7 +3,7 @@
 use crate::sweep::{rms, row};
 use ridgewatch::field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch::render::smooth::{
-    AuditedPixel, FIRST_AUDIT_RAY, LightVolume, MarchControl, Medium, NET, Nodes, Picture, RaySum, Refinement, ToLight, ToneMap,
+    AuditedPixel, FIRST_AUDIT_RAY, LightVolume, MarchControl, Medium, NET, Nodes, Picture, RaySum, Refinement, StepsError, ToLight, ToneMap,
 };
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::cell::Cell;
@@ -167,7 +167,7 @@ fn marching_too_coarse() {
                 sum: false,
                 samples: 2.0,
                 budget: None,
-                steps_error: [0.0; 3],
+                steps_error: StepsError::default(),
                 number,
                 stop: &NEVER,
             };
@@ -271,7 +271,7 @@ fn corrected(nodes: &Nodes, samples: f64) -> Refinement<'_> {
         sum: false,
         samples,
         budget: None,
-        steps_error: [0.0; 3],
+        steps_error: StepsError::default(),
         number: 0,
         stop: &NEVER,
     }

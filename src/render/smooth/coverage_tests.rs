@@ -1,7 +1,7 @@
 //! How often the stated intervals hold, and how fast the error falls, over pictures and scenes whose exact picture is known: the traced
 //! field is that of nodes, which are marched finely.
 
-use super::{ErrorEstimate, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
+use super::{ErrorEstimate, Medium, Nodes, Picture, RaySum, Refinement, StepsError, ToLight};
 use crate::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, Target, TransferSettings};
 use rayon::prelude::*;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
@@ -103,7 +103,7 @@ fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Metho
                 sum,
                 samples,
                 budget: None,
-                steps_error: [0.0; 3],
+                steps_error: StepsError::default(),
                 number,
                 stop: &NEVER,
             };
@@ -163,7 +163,7 @@ fn errors_of_pixels_hold() {
                         sum: false,
                         samples: 1.0,
                         budget: None,
-                        steps_error: [0.0; 3],
+                        steps_error: StepsError::default(),
                         number,
                         stop: &NEVER,
                     };
@@ -204,7 +204,7 @@ fn a_target_is_reached_when_it_is_met() {
                 sum: false,
                 samples: 1.0,
                 budget: None,
-                steps_error: [0.0; 3],
+                steps_error: StepsError::default(),
                 number,
                 stop: &NEVER,
             };
@@ -240,7 +240,7 @@ fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
             sum: true,
             samples: 1.0,
             budget: None,
-            steps_error: [0.0; 3],
+            steps_error: StepsError::default(),
             number,
             stop: &NEVER,
         };
@@ -280,7 +280,7 @@ fn a_shrunk_correction_converges_with_its_samples() {
                 sum,
                 samples,
                 budget: None,
-                steps_error: [0.0; 3],
+                steps_error: StepsError::default(),
                 number: number as u64,
                 stop: &NEVER,
             };

@@ -28,7 +28,7 @@ pub use medium::{IsMissing, Medium, node_spacing};
 pub use nodes::{BRICK, Nodes, brick_shape, own_nodes};
 pub use picture::{Picture, Refinement};
 pub use regression::Guides;
-pub use statement::{ErrorEstimate, MarchError, PictureError, TileErrors, TileSums, noise_psnr};
+pub use statement::{ErrorEstimate, MarchError, PictureError, StepsError, TileErrors, TileSums, noise_psnr};
 pub use {
     allocation::{Allocation, TILE},
     march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR},

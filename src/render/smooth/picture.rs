@@ -9,7 +9,7 @@ use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH,
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
-use super::statement::{LIT, PictureError, TileErrors, TileSums, error_at, errors_of_tiles};
+use super::statement::{LIT, PictureError, StepsError, TileErrors, TileSums, error_at, errors_of_tiles};
 use super::tone::ToneMap;
 use crate::renderer::RenderStats;
 use crate::rng::FrameRandom;
@@ -47,8 +47,8 @@ pub struct Refinement<'a> {
     pub samples: f64,
     /// Seconds that the round should take, if they are limited.
     pub budget: Option<f64>,
-    /// Mean square error of the Runge-Kutta steps over lit pixels, in the weightings of [`TileErrors`], which the picture states too; 0: not measured.
-    pub steps_error: [f64; 3],
+    /// Error of the Runge-Kutta steps, which the picture states too.
+    pub steps_error: StepsError,
     /// Number that selects the random stream when the picture starts anew.
     pub number: u64,
     /// Setting it ends the round early, without a film; the picture then starts anew.
@@ -147,7 +147,7 @@ impl Picture {
         };
         let combined = combine(&self.sums, &Guides::new(&self.base, self.march.rays, width), how);
         let (film, error) = loop {
-            let (film, error, tiles) = self.film(scene, [width, height], how, &combined, round.steps_error);
+            let (film, error, tiles) = self.film(scene, [width, height], how, &combined, &round.steps_error);
             // Samples that go where earlier ones saw a difference would make their mean biased (Kirk and Arvo 1991).
             if !round.is_mended() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
@@ -324,7 +324,7 @@ impl Picture {
         [width, height]: [usize; 2],
         how: Correction,
         combined: &Combined,
-        steps: [f64; 3],
+        steps: &StepsError,
     ) -> (Film, PictureError, Vec<TileSums>) {
         let mut film = Film::new(width, height);
         let per_ray = 1.0 / self.march.rays as f32;
@@ -351,7 +351,7 @@ impl Picture {
         let of_pixel = |(i, colour): (usize, &[f32; 4])| {
             let is_lit = colour[3] > LIT;
             // Pixels that are not lit have hardly any of march and steps.
-            let marched = if is_lit { (march + steps[0]) as f32 } else { 0.0 };
+            let marched = if is_lit { (march + steps.squared[0]) as f32 } else { 0.0 };
             (error_at(&of_tiles, across, [i % width, i / width], is_lit) + marched).sqrt()
         };
         film.error = film.rgba.par_iter().enumerate().with_min_len(1 << 12).map(of_pixel).collect();

@@ -55,6 +55,15 @@ impl ErrorEstimate {
     }
 }
 
+/// Mean square error of a picture's Runge-Kutta steps over lit pixels and channels, in the weightings of [`TileErrors`]; 0: not measured.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct StepsError {
+    /// Mean over rays.
+    pub squared: [f64; 3],
+    /// Its standard error.
+    pub deviation: [f64; 3],
+}
+
 /// Stated error of a picture, against the picture of the traced field without noise. Of a map, radiance is the FTLE's place in the range of the colours
 /// (0 to 1), lit pixels are those with a value, and samples are seeds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -157,17 +166,21 @@ impl PictureError {
         [self.rms, self.relmse, self.psnr, self.psnr_all].iter().all(|e| e.value.is_finite() && e.low.is_finite() && e.high.is_finite())
     }
 
-    /// Error of a picture from its tiles, the error of its march, and the mean square error of its Runge-Kutta steps over lit pixels, in the weightings of
-    /// [`TileErrors`]; 0: not measured.
-    pub fn of(tiles: &[TileSums], march: &MarchError, steps: [f64; 3], samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
+    /// Error of a picture from its tiles and the errors of its march and its Runge-Kutta steps.
+    pub fn of(tiles: &[TileSums], march: &MarchError, steps: &StepsError, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
         let lit = |weighting: usize| {
-            march.added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting).plus([steps[weighting], 0.0])
+            march
+                .added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting)
+                .plus([steps.squared[weighting], steps.deviation[weighting]])
         };
         let pixels = |of: fn(&TileSums) -> f32| tiles.iter().map(|tile| f64::from(of(tile))).sum::<f64>();
         let share_lit = pixels(|tile| tile.lit.pixels) / pixels(|tile| tile.all.pixels).max(1.0);
-        let of_lit = [march.squared[2] + steps[2], march.deviation[2]].map(|of| share_lit * of);
+        let of_lit = |of: [f64; 2]| of.map(|of| share_lit * of);
         let of_unlit = march.unlit.map(|of| (1.0 - share_lit) * of);
-        let all = estimate(tiles.iter().map(|tile| &tile.all), 2).plus(of_lit).plus(of_unlit);
+        let all = estimate(tiles.iter().map(|tile| &tile.all), 2)
+            .plus(of_lit([march.squared[2], march.deviation[2]]))
+            .plus(of_lit([steps.squared[2], steps.deviation[2]]))
+            .plus(of_unlit);
         let decibels = |e: ErrorEstimate| {
             let e = e.map(|mse| -10.0 * mse.max(1e-12).log10());
             ErrorEstimate { value: e.value, low: e.high, high: e.low }
@@ -178,7 +191,7 @@ impl PictureError {
             psnr: decibels(lit(2)),
             psnr_all: decibels(all),
             march_rms: march.squared[0].sqrt(),
-            steps_rms: steps[0].sqrt(),
+            steps_rms: steps.squared[0].sqrt(),
             unbiased: false,
             samples_per_pixel,
             rays_per_pixel,
@@ -329,7 +342,10 @@ mod tests {
 
     #[test]
     fn the_error_of_steps_adds_to_all_that_is_stated() {
-        let of = |steps: [f64; 3]| PictureError::of(&tiles_of(&[4e-4; 64], 1e-4), &MarchError::default(), steps, 1.0, 4);
+        let of = |squared: [f64; 3]| {
+            let steps = StepsError { squared, ..StepsError::default() };
+            PictureError::of(&tiles_of(&[4e-4; 64], 1e-4), &MarchError::default(), &steps, 1.0, 4)
+        };
         let (error, found) = (of([0.0; 3]), of([5e-4, 2e-3, 3e-4]));
         let square = |decibels: f64| 10f64.powf(-0.1 * decibels);
         for (before, after) in [(error.rms.value, found.rms.value), (error.rms.low, found.rms.low), (error.rms.high, found.rms.high)] {
@@ -349,7 +365,7 @@ mod tests {
     #[test]
     fn all_pixels_have_the_march_of_their_own_kind() {
         let march = MarchError { squared: [0.0, 0.0, 2e-4], unlit: [6e-4, 0.0], ..MarchError::default() };
-        let found = PictureError::of(&tiles_of(&[0.0; 4], 0.0), &march, [0.0; 3], 1.0, 4);
+        let found = PictureError::of(&tiles_of(&[0.0; 4], 0.0), &march, &StepsError::default(), 1.0, 4);
         assert!((found.psnr.value + 10.0 * 2e-4_f64.log10()).abs() < 1e-6, "{found:?}");
         // The pixels themselves err by 1e-6 where they are not lit.
         assert!((found.psnr_all.value + 10.0 * (4e-4_f64 + 0.5e-6).log10()).abs() < 1e-6, "{found:?}");

@@ -203,7 +203,7 @@ impl GpuSmooth {
             let shows_march = film.shows == self.marches;
             let early = (!self.control.is_due()).then_some((&mut film, shows_march));
             let tiles = self.combine.combine(&input, early)?;
-            let error = PictureError::of(tiles, &self.control.errors(), round.smooth.steps_error, samples_per_pixel, self.control.rays);
+            let error = PictureError::of(tiles, &self.control.errors(), &round.smooth.steps_error, samples_per_pixel, self.control.rays);
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
@@ -220,7 +220,7 @@ impl GpuSmooth {
             marching += self.march(round, renderer, &parameters)?;
         };
         let shows_march = film.shows == self.marches;
-        let of_march = self.control.error() + round.smooth.steps_error[0];
+        let of_march = self.control.error() + round.smooth.steps_error.squared[0];
         self.combine.finish(&of_tiles, of_march as f32, &mut film, shows_march)?;
         film.shows = self.marches;
         let shown = self.films.put(film);
