@@ -176,7 +176,7 @@ mod tests {
         let renderer = renderer();
         let rays = renderer.ray_points(256, 8);
         let truth = vec![0.5; rays.points.len()];
-        let noise = |i: usize| if philox([i as u32, 0, 0, 0], [7, 0])[0] % 2 == 0 { 0.52 } else { 0.48 };
+        let noise = |i: usize| if philox([i as u32, 0, 0, 0], [7, 0])[0].is_multiple_of(2) { 0.52 } else { 0.48 };
         let [one_way, both_ways] = [vec![0.52; truth.len()], (0..truth.len()).map(noise).collect()]
             .map(|shown| renderer.pictures_apart(&rays, &shown, &truth).unwrap().squared[0]);
         // Of eight points a net the mean has an eighth of the square, which a single net would count.

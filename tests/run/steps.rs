@@ -94,7 +94,6 @@ fn the_picture_states_what_fewer_steps_leave_in_it() {
     let apart = |[few, many]: &[Arc<Film>; 2], pixel: usize, k: usize| f64::from(few.rgba[pixel][k] - many.rgba[pixel][k]);
     let square = |&pixel: &usize| (0..3).map(|k| apart(&one, pixel, k) * apart(&other, pixel, k)).sum::<f64>() / 3.0;
     let rms = (lit.iter().map(square).sum::<f64>() / lit.len() as f64).sqrt();
-    println!("{:?} steps: {rms}, stated {} of {}", report.integration_steps, stated.steps_rms, stated.rms.value);
     assert!((0.8..=1.25).contains(&(stated.steps_rms / rms)), "{rms}, stated {}", stated.steps_rms);
     assert!(stated.rms.value >= stated.steps_rms && stated.rms.low >= stated.steps_rms, "{stated:?}");
     // Steps that the scene gives, or the log-stretch asks for, are those of the field.
