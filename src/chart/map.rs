@@ -26,10 +26,13 @@ pub(super) fn curve(charting: &mut Charting<'_>, opened: &Opened, windows: &Wind
     let transfer = colours_of(&scene, Method::Map, charting.device, windows.slides)?;
     let range = transfer.low.zip(transfer.high).map(|(low, high)| [low, high]);
     scene.transfer = Some(transfer);
-    // Steps count as an error, as in pictures of volumes.
+    // More steps than the picture has, so that what these lose counts as an error.
     let mut finer = scene.clone();
-    if let Some(steps) = opened.chosen_steps(&charting.pool)? {
-        finer.flow.steps = StepsSetting::Fixed(2 * steps);
+    let given = if let StepsSetting::Fixed(steps) = scene.flow.steps { steps } else { 0 };
+    match opened.chosen_steps(&charting.pool) {
+        Ok(Some(steps)) => finer.flow.steps = StepsSetting::Fixed(2 * given.max(steps)),
+        Ok(None) => {}
+        Err(error) => return charting.refused("pictures by map", error).map(|()| None),
     }
     let truth = |slide: usize| {
         let (truth, _) = truth(windows, &finer, slide, TRUTH_SHARES[slide.min(1)] * left)?;
@@ -41,20 +44,23 @@ pub(super) fn curve(charting: &mut Charting<'_>, opened: &Opened, windows: &Wind
         if !still.mean.ftle_mean.iter().any(|ftle| ftle.is_finite()) {
             return Ok(false);
         }
-        measure(windows, &scene, &still, 0.8 * longest, &mut curve.frames)?;
-        if windows.slides.count() >= SLIDES {
-            curve.sliding = sliding(windows, &scene, Some(&truth(SLIDES - 1)?), 0.2 * longest)?;
-        }
-        Ok(true)
+        measure(windows, &scene, &still, 0.8 * longest, &mut curve.frames).map(|_| true)
     };
     match measured() {
-        Ok(true) => Ok(Some(curve)),
+        Ok(true) => {}
         Ok(false) => {
             charting.skip("pictures by map", "no pixel shows the flow");
-            Ok(None)
+            return Ok(None);
         }
-        Err(error) => charting.refused("pictures by map", error).map(|()| None),
+        Err(error) => return charting.refused("pictures by map", error).map(|()| None),
     }
+    if windows.slides.count() >= SLIDES {
+        match truth(SLIDES - 1).and_then(|truth| sliding(windows, &scene, Some(&truth), 0.2 * longest)) {
+            Ok(found) => curve.sliding = found,
+            Err(error) => charting.refused("a sliding window by map", error)?,
+        }
+    }
+    Ok(Some(curve))
 }
 
 /// Errors of a map's FTLE, as shares of the range of its colours, against two independent maps, over pixels with a value in all three.
@@ -70,7 +76,8 @@ pub(super) fn errors(film: &Film, [a, b]: &[Film; 2], [low, high]: [f64; 2]) -> 
             count += 1.0;
         }
     }
-    let psnr = decibels(squares, count);
+    // Without a pixel in common there is none.
+    let psnr = if count > 0.0 { decibels(squares, count) } else { f64::NAN };
     PictureErrors { rms: (squares[0] / count).max(0.0).sqrt(), psnr, psnr_all: psnr, relmse: (relative / count).max(0.0) }
 }
 

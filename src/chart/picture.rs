@@ -442,7 +442,7 @@ pub(super) fn sliding(windows: &Windows<'_>, scene: &Settings, truth: Option<&Tr
             seconds += record.seconds.slide + record.seconds.total;
             frames += 1;
             if record.slide + 1 == SLIDES as u64 {
-                psnr = truth.map(|truth| truth.errors(&film, tone_map).psnr);
+                psnr = truth.map(|truth| truth.errors(&film, tone_map).psnr).filter(|psnr| psnr.is_finite());
             }
             enough.store(seconds > longest || windows.stop.load(Ordering::Relaxed), Ordering::Relaxed);
         }

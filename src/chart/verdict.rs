@@ -178,9 +178,11 @@ fn rate(curve: &PictureCurve) -> Option<String> {
 
 /// When the map reaches each target.
 fn of_map(curve: &PictureCurve) -> String {
-    let reached = TARGETS.iter().filter_map(|&target| Some(format!("{target} dB after {}", duration(curve.seconds_to(target)?))));
-    let reached: Vec<String> = reached.collect();
-    let reached = if reached.is_empty() { "no target was reached".to_owned() } else { reached.join(", ") };
+    let reached = TARGETS.iter().map(|&target| match curve.seconds_to(target) {
+        Some(seconds) => format!("{target} dB after {}", duration(seconds)),
+        None => format!("{target} dB not in the time given"),
+    });
+    let reached = reached.collect::<Vec<_>>().join(", ");
     let sliding = rate(curve).map_or(String::new(), |rate| format!("; of a window that slides at every frame, {rate}"));
     format!("The map, of which the FTLE of each pixel is compared: {reached}{sliding}.")
 }

@@ -16,7 +16,7 @@ const FAINT: f32 = 1e-3;
 /// Fewest lit pixels that tell how far two pictures are apart.
 const FEWEST_LIT: usize = 16;
 
-/// Points on rays through a picture: two nets a pixel, on rays through random places of it, the one in the middle between the depths of the other.
+/// Points on rays through a picture: two nets a pixel, on rays through random places of it, at even distances from random depths on.
 #[derive(Debug, Clone)]
 pub struct RayPoints {
     /// Points of the nets, from front to back, one net after the other; behind them coarse nodes of the whole box, through which light comes.
@@ -33,26 +33,31 @@ pub struct RayPoints {
 impl Renderer {
     /// Nets of `per_net` points in those of `pixels` pixels, spread evenly over the picture, whose rays meet the box. The same for every seed.
     pub fn ray_points(&self, pixels: usize, per_net: usize) -> RayPoints {
-        const GOLDEN: f64 = 0.618_033_988_749_894_8;
         let scene = self.frame_scene(0);
         let size = [scene.width, scene.height].map(|count| count as f64);
         let edges = scene.space.edges();
         let is_flat = self.is_flat();
         let volume: f64 = edges[..if is_flat { 2 } else { 3 }].iter().product();
-        let apart = (volume / LIGHT_NODES).powf(if is_flat { 0.5 } else { 1.0 / 3.0 });
-        let shape = [0, 1, 2].map(|axis| if axis == 2 && is_flat { 1 } else { (edges[axis] / apart).round().max(1.0) as usize + 1 });
+        let mut apart = (volume / LIGHT_NODES).powf(if is_flat { 0.5 } else { 1.0 / 3.0 });
+        let shape = loop {
+            let shape = [0, 1, 2].map(|axis| if axis == 2 && is_flat { 1 } else { (edges[axis] / apart).round().max(1.0) as usize + 1 });
+            // A thin box has two nodes across.
+            if shape.into_iter().map(|nodes| nodes as f64).product::<f64>() <= 2.0 * LIGHT_NODES {
+                break shape;
+            }
+            apart *= 1.25;
+        };
         let mut found = RayPoints { points: Vec::new(), places: Vec::new(), per_net, spacing: Vec::new(), shape };
         for (number, place) in footprint(0, 0, 0, 0..pixels).enumerate() {
-            let within = philox([number as u32, 0, 0, 0], [0, 0]).map(|word| f64::from(unit(word)));
+            let [within, depths] = [0, 1].map(|which| philox([number as u32, which, 0, 0], [0, 0]).map(|word| f64::from(unit(word))));
             let rays: [_; 2] = std::array::from_fn(|net| {
                 let [u, v] = [0, 1].map(|axis| ((place[axis] * size[axis]).floor() + within[2 * net + axis]) / size[axis]);
                 let (eye, toward) = scene.camera.ray(2.0 * u - 1.0, 1.0 - 2.0 * v);
                 scene.space.intersect(eye, toward).map(|ends| (eye, toward, ends))
             });
             let [Some(one), Some(other)] = rays else { continue };
-            for (net, (eye, toward, (enter, leave))) in [(0.0, one), (0.5, other)] {
+            for ((eye, toward, (enter, leave)), shift) in [one, other].into_iter().zip(depths) {
                 let spacing = (leave - enter) / per_net as f64;
-                let shift = (number as f64 * GOLDEN + net).fract();
                 for i in 0..per_net {
                     let along = enter + (i as f64 + shift) * spacing;
                     let point: [f64; 3] = std::array::from_fn(|k| eye[k] + along * toward[k]);
@@ -67,10 +72,10 @@ impl Renderer {
     }
 
     /// Mean square difference over lit pixels between pictures of two fields, given by their log-stretch at the points of `rays`. The second one is that of
-    /// the true steps. NaN is empty space.
+    /// the true steps. NaN is a missing cell.
     ///
-    /// The product of what both nets of a pixel differ by has the square of the pixel's difference as its mean: what averages out along a ray or over the
-    /// pixel does not count. `None` if hardly a pixel is lit.
+    /// The product of what both nets of a pixel differ by has the square of the pixel's difference as its mean, since they are independent (to first order in
+    /// all but the linear weighting): what averages out along a ray or over the pixel does not count. `None` if hardly a pixel is lit.
     pub fn pictures_apart(&self, rays: &RayPoints, shown: &[f32], truth: &[f32]) -> Option<StepsError> {
         let tone_map = ToneMap::new(self.scene().settings.tone_map);
         let lowest = self.transfer().range()[0] as f32 / self.inverse_tau() as f32;
@@ -95,8 +100,9 @@ impl Renderer {
         (squares.len() >= FEWEST_LIT).then(|| {
             let mean: [f64; 3] = std::array::from_fn(|weighting| squares.iter().map(|square| square[weighting]).sum::<f64>() / count);
             let scatter = |weighting: usize| squares.iter().map(|square| (square[weighting] - mean[weighting]).powi(2)).sum::<f64>();
-            // The product of noise may be below 0.
-            StepsError { squared: mean.map(|mean| mean.max(0.0)), deviation: std::array::from_fn(|w| scatter(w).sqrt() / count) }
+            let deviation: [f64; 3] = std::array::from_fn(|weighting| scatter(weighting).sqrt() / count);
+            // As with the march, a mean below half of its standard error says no more than that.
+            StepsError { squared: std::array::from_fn(|w| mean[w].max(0.5 * deviation[w])), deviation }
         })
     }
 
@@ -105,9 +111,10 @@ impl Renderer {
         let scene = self.frame_scene(0);
         let medium = Medium { scene: &scene, nodes, missing: None };
         let step = medium.spacing() as f32;
-        let (mut radiance, mut transmittance) = ([0.0; 3], 1.0_f32);
+        let (mut radiance, mut transmittance, mut in_missing) = ([0.0; 3], 1.0_f32, 0);
         for point in net * rays.per_net..(net + 1) * rays.per_net {
             if !log_stretch[point].is_finite() {
+                in_missing += 1;
                 continue;
             }
             let ftle = log_stretch[point] * scene.inverse_tau;
@@ -125,7 +132,9 @@ impl Renderer {
             let scattered = PHASE * weight * (-medium.depth_to_light(place, step)).exp();
             (0..3).for_each(|k| radiance[k] += f64::from(scattered * albedo[k] * light[k]));
         }
-        (std::array::from_fn(|k| radiance[k] + f64::from(transmittance * scene.background[k])), 1.0 - transmittance)
+        let share = in_missing as f32 / rays.per_net as f32;
+        let behind = |k: usize| (1.0 - share) * scene.background[k] + share * scene.missing[k];
+        (std::array::from_fn(|k| radiance[k] + f64::from(transmittance * behind(k))), 1.0 - transmittance)
     }
 }
 

@@ -42,6 +42,7 @@ const FINE_IN_TIME: f64 = 0.01;
 const FRAMES_WHILE_PAUSED: usize = 32;
 /// Interval at which a run that waits for a command looks for the end, and for the simulation.
 const GLANCE: Duration = Duration::from_millis(2);
+
 /// A run and the session that computes.
 pub(super) struct Cycle<'a, B: Backend> {
     pub(super) run: Run<'a>,
@@ -316,6 +317,7 @@ impl<B: Backend> Cycle<'_, B> {
             let commands = self.run.apply_commands();
             if commands > Commands::None {
                 since_command = Some(0);
+                self.run.steps_are_of_another_picture = true;
             }
             if commands >= Commands::Colours {
                 self.run.report.is_steered = true;
@@ -377,6 +379,9 @@ impl<B: Backend> Cycle<'_, B> {
                 };
                 let is_soon = since_command.is_none() && expected >= SOON_FROM && self.run.render.budget.is_none();
                 place.after = is_soon.then_some(shown);
+                if shown == 1 {
+                    self.measure_steps(slide)?;
+                }
                 let is_only_slide = slide.index == 0 && slides.is_over();
                 place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
             }

@@ -47,8 +47,9 @@ pub(super) struct Run<'a> {
     /// The newest budget, also while the method has none.
     pub(super) budget: Option<f64>,
     pub(super) transfer: TransferRecord,
-    /// What the steps leave in smooth pictures.
+    /// What the steps leave in smooth pictures, and whether that was measured for another picture than the one that is shown.
     pub(super) steps_error: StepsError,
+    pub(super) steps_are_of_another_picture: bool,
     /// A command set the range of the colours.
     pub(super) has_range: bool,
     pub(super) color_bar: Arc<ColorBar>,
@@ -300,6 +301,7 @@ impl<'a> Run<'a> {
             render,
             transfer,
             steps_error: StepsError::default(),
+            steps_are_of_another_picture: false,
             has_range: false,
             color_bar,
             learning,

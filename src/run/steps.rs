@@ -31,6 +31,8 @@ const TARGET_SHARE: f64 = 0.1;
 /// Pixels by which pictures are compared at first, and most if these do not tell; points of each of the two nets of a pixel.
 const PIXELS: usize = 512;
 const MOST_PIXELS: usize = 4 * PIXELS;
+/// Points that are traced at once, after which a stop is looked for.
+const AT_ONCE: usize = 1 << 12;
 const PER_NET: usize = 12;
 /// Smallest share of the points on which something is to be seen.
 const MIN_SHOWN: f64 = 1.0 / 32.0;
@@ -87,7 +89,7 @@ impl Shown<'_> {
 }
 
 /// A number of steps, and how far it is from twice as many as the log-stretch asks for. Root mean squares over points of the domain.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct PictureSteps {
     pub(super) steps: usize,
     /// Difference of the log-stretch.
@@ -96,6 +98,17 @@ pub(super) struct PictureSteps {
     pub(super) residual: f64,
     /// How far the picture is from that of the steps that the log-stretch asks for; 0: these are the steps, or it was not measured.
     pub(super) picture: StepsError,
+    /// Fewer steps had colours that suit, but showed in the picture.
+    pub(super) by_picture: bool,
+}
+
+impl PictureSteps {
+    /// The error in a picture whose points have another optical residual: its square goes with that of the points, until it is measured.
+    fn scaled_to(&self, residual: f64) -> StepsError {
+        let share = if self.residual > 0.0 { (residual / self.residual).powi(2) } else { 1.0 };
+        let StepsError { squared, deviation } = self.picture;
+        StepsError { squared: squared.map(|of| share * of), deviation: deviation.map(|of| share * of) }
+    }
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
@@ -108,11 +121,9 @@ pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice)
     let cells = if shown.plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
     let work = Work::begin("choosing the steps of the picture");
     let Some(mut comparison) = Comparison::new(shown, slide, cells, 0, 2 * chosen.steps)? else {
-        return Ok((
-            PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0, picture: StepsError::default() },
-            None,
-        ));
+        return Ok((PictureSteps { steps: chosen.steps, difference: chosen.difference, residual: 0.0, ..PictureSteps::default() }, None));
     };
+    let mut by_picture = false;
     let mut multiple = if chosen.within_tolerance { 1 } else { chosen.steps / chosen.multiple_of };
     while multiple * chosen.multiple_of < chosen.steps {
         // Where it ends is not known.
@@ -122,13 +133,14 @@ pub(super) fn picture_steps(shown: Shown<'_>, slide: &Slide, chosen: StepChoice)
         if found.residual <= shown.most() {
             let (picture, suits) = comparison.in_picture(shown, slide, [found.steps, chosen.steps])?;
             if suits {
-                found.picture = picture;
+                (found.picture, found.by_picture) = (picture, by_picture);
                 return Ok((found, Some(comparison)));
             }
+            by_picture = true;
         }
         multiple = (multiple + 1).max(multiple * 5 / 4);
     }
-    let found = comparison.of(shown, slide, chosen.steps)?;
+    let found = PictureSteps { by_picture, ..comparison.of(shown, slide, chosen.steps)? };
     comparison.of_steps = found.residual;
     Ok((found, Some(comparison)))
 }
@@ -151,10 +163,13 @@ pub(super) fn is_outdated(
     // Where the choice had no more steps to give, their residual may be larger.
     let most = if settled.steps < chosen.steps { shown.most() } else { shown.most().max(settled.residual) };
     comparison.of_steps = comparison.of(shown, slide, settled.steps)?.residual;
-    let share = comparison.of_steps / most;
+    let shows = settled.steps < chosen.steps && shown.suits(&settled.scaled_to(comparison.of_steps)) == Some(false);
+    let is_too_much = comparison.of_steps > *AGAIN.end() * most || shows;
     // Outside its tolerance a choice has no fewer steps to give either.
     let is_least = settled.steps <= chosen.multiple_of || !chosen.within_tolerance;
-    Ok((share > *AGAIN.end() || share < *AGAIN.start() && !is_least, Some(comparison)))
+    // What the picture decided is compared with itself.
+    let usual = if settled.by_picture { settled.residual } else { most };
+    Ok((is_too_much || comparison.of_steps < *AGAIN.start() * usual && !is_least, Some(comparison)))
 }
 
 /// Whether the scene leaves the number of steps to the picture.
@@ -173,11 +188,24 @@ pub(super) struct Comparison {
     pub(super) of_steps: f64,
 }
 
-/// Rays through `count` pixels: points on them, and their log-stretch with the steps that it asks for.
+/// Rays through so many pixels: points on them, and their log-stretch with the steps that it asks for.
 struct Rays {
+    pixels: usize,
     points: RayPoints,
     truth: Vec<f32>,
-    count: usize,
+}
+
+impl Rays {
+    fn new(shown: Shown<'_>, slide: &Slide, pixels: usize, steps: usize) -> Result<Self, RunEnd> {
+        let points = shown.renderer.ray_points(pixels, PER_NET);
+        Ok(Self { pixels, truth: along_rays(shown, slide, &points, steps)?, points })
+    }
+
+    /// How far the picture of other steps is from the true one; `None` if hardly a pixel is lit.
+    fn apart(&self, shown: Shown<'_>, slide: &Slide, steps: usize) -> Result<Option<StepsError>, RunEnd> {
+        let found = along_rays(shown, slide, &self.points, steps)?;
+        Ok(shown.renderer.pictures_apart(&self.points, &found, &self.truth))
+    }
 }
 
 impl Comparison {
@@ -203,28 +231,26 @@ impl Comparison {
         shown.tracer(slide, steps)?.trace(&self.points, Extras::default(), &mut traced);
         let pairs = traced.log_stretch.iter().zip(&self.truth.log_stretch);
         let difference = upper_rms(pairs.map(|(a, b)| f64::from(a - b)).filter(|difference| difference.is_finite()));
-        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced), picture: StepsError::default() })
+        Ok(PictureSteps { steps, difference, residual: self.residual(shown, &traced), ..PictureSteps::default() })
     }
 
-    /// Mean square difference between the pictures of `few` and of `many` steps, and whether it is small enough; 0 if hardly anything is lit.
+    /// How far the picture of `few` steps is from that of `many`, and whether that is little enough. Where hardly anything is lit, nothing is told, and
+    /// any are.
     fn in_picture(&mut self, shown: Shown<'_>, slide: &Slide, [few, many]: [usize; 2]) -> Result<(StepsError, bool), RunEnd> {
-        let mut count = PIXELS;
-        loop {
-            if self.rays.as_ref().is_none_or(|rays| rays.count < count) {
-                let points = shown.renderer.ray_points(count, PER_NET);
-                self.rays = Some(Rays { truth: along_rays(shown, slide, &points, many)?, points, count });
-            }
-            let Some(Rays { points, truth, count: known }) = &self.rays else { continue };
-            let found = along_rays(shown, slide, points, few)?;
-            let Some(found) = shown.renderer.pictures_apart(points, &found, truth) else { return Ok((StepsError::default(), true)) };
-            match shown.suits(&found) {
-                Some(suits) => return Ok((found, suits)),
-                None if *known >= MOST_PIXELS => {
-                    return Ok((found, shown.suits(&StepsError { deviation: [0.0; 3], ..found }) == Some(true)));
-                }
-                None => count = 4 * known,
-            }
+        let mut rays = match self.rays.take() {
+            Some(rays) => rays,
+            None => Rays::new(shown, slide, PIXELS, many)?,
+        };
+        let mut found = rays.apart(shown, slide, few)?;
+        let is_open = found.as_ref().is_none_or(|found| shown.suits(found).is_none());
+        if is_open && rays.pixels < MOST_PIXELS {
+            rays = Rays::new(shown, slide, MOST_PIXELS, many)?;
+            found = rays.apart(shown, slide, few)?;
         }
+        self.rays = Some(rays);
+        // Where the standard error leaves it open, the mean decides.
+        let by_mean = |found: &StepsError| shown.suits(&StepsError { deviation: [0.0; 3], ..*found }) == Some(true);
+        Ok(found.map_or((StepsError::default(), true), |found| (found, shown.suits(&found).unwrap_or_else(|| by_mean(&found)))))
     }
 
     /// Optical residual of what was traced at the points.
@@ -255,7 +281,7 @@ impl<B: Backend> Cycle<'_, B> {
         let (settled, compared) = self.run.threads.render().install(|| picture_steps(shown, slide, chosen))?;
         self.compared = compared;
         self.settled = Some((chosen, settled));
-        self.run.steps_error = settled.picture;
+        (self.run.steps_error, self.run.steps_are_of_another_picture) = (settled.picture, false);
         if settled.steps < chosen.steps {
             tracing::info!("{settled:?} instead of {chosen:?}");
             self.take_steps(chosen, Some(settled));
@@ -291,16 +317,14 @@ impl<B: Backend> Cycle<'_, B> {
         tracing::debug!("looked at the steps of slide {} for {:.1} ms", slide.index, 1e3 * begin.elapsed().as_secs_f64());
         let (chosen, settled) = match anew {
             None => {
-                // What the picture loses goes with the square of what points do.
-                let share = residual.filter(|_| settled.residual > 0.0).map_or(1.0, |residual| (residual / settled.residual).powi(2));
-                let StepsError { squared, deviation } = settled.picture;
-                let [squared, deviation] = [squared, deviation].map(|of| of.map(|of| share * of));
-                self.run.steps_error = StepsError { squared, deviation };
+                self.run.steps_error = residual.map_or(settled.picture, |residual| settled.scaled_to(residual));
+                self.run.steps_are_of_another_picture = true;
                 return Ok(false);
             }
             Some(Ok(anew)) => anew,
             Some(Err(error)) => {
                 self.run.progress.warnings.push(format!("slide {}: {error}; the picture keeps {} steps", slide.index, settled.steps));
+                self.run.steps_are_of_another_picture = true;
                 return Ok(false);
             }
         };
@@ -313,9 +337,22 @@ impl<B: Backend> Cycle<'_, B> {
         tracing::info!("{settled:?} in slide {}; for the log-stretch {chosen:?}", slide.index);
         let before = self.map.steps;
         self.settled = Some((chosen, settled));
-        self.run.steps_error = settled.picture;
+        (self.run.steps_error, self.run.steps_are_of_another_picture) = (settled.picture, false);
         self.take_steps(chosen, Some(settled).filter(|settled| settled.steps < chosen.steps));
         Ok(self.map.steps != before)
+    }
+
+    /// Measures what the steps leave in the picture, if that was last done for another one. For each view that a drag passes it would take too long.
+    pub(super) fn measure_steps(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        let is_due = std::mem::take(&mut self.run.steps_are_of_another_picture) && self.run.render.method.is_smooth();
+        let Some((chosen, settled)) = self.settled.filter(|(chosen, settled)| is_due && settled.steps < chosen.steps) else {
+            return Ok(());
+        };
+        let _work = Work::begin("measuring what the steps leave in the picture");
+        let shown = self.run.shown();
+        let measure = || Rays::new(shown, slide, PIXELS, chosen.steps)?.apart(shown, slide, settled.steps);
+        self.run.steps_error = self.run.threads.render().install(measure)?.unwrap_or_default();
+        Ok(())
     }
 
     /// Takes the steps of the picture, or else those of the log-stretch.
@@ -326,7 +363,11 @@ impl<B: Backend> Cycle<'_, B> {
         report.integration_steps = Some(steps);
         report.integration_difference = Some(difference).filter(|difference| difference.is_finite());
         report.integration_residual = settled.map(|settled| settled.residual);
-        Decision::new("flow.steps", steps, why_steps(difference, report.integration_residual)).enter(&mut report.decisions);
+        let mut why = why_steps(difference, report.integration_residual);
+        if settled.is_some_and(|settled| settled.by_picture) {
+            why += "; fewer show in the picture";
+        }
+        Decision::new("flow.steps", steps, why).enter(&mut report.decisions);
     }
 }
 
@@ -337,15 +378,19 @@ pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
 
 /// Log-stretch at points of rays; NaN in missing cells.
 fn along_rays(shown: Shown<'_>, slide: &Slide, rays: &RayPoints, steps: usize) -> Result<Vec<f32>, RunEnd> {
-    check_stop(shown.stop)?;
-    progress::mark();
     let tracer = shown.tracer(slide, steps)?;
-    let is_known: Vec<bool> = rays.points.iter().map(|&point| !tracer.is_missing(point)).collect();
-    let known: Vec<DomainPoint> = rays.points.iter().zip(&is_known).filter_map(|(&point, known)| known.then_some(point)).collect();
+    let mut found = Vec::with_capacity(rays.points.len());
     let mut traced = Traced::default();
-    tracer.trace(&known, Extras::default(), &mut traced);
-    let mut found = traced.log_stretch.iter().copied();
-    Ok(is_known.into_iter().map(|known| if known { found.next().unwrap_or(f32::NAN) } else { f32::NAN }).collect())
+    for points in rays.points.chunks(AT_ONCE) {
+        check_stop(shown.stop)?;
+        progress::mark();
+        let is_known: Vec<bool> = points.iter().map(|&point| !tracer.is_missing(point)).collect();
+        let known: Vec<DomainPoint> = points.iter().zip(&is_known).filter_map(|(&point, known)| known.then_some(point)).collect();
+        tracer.trace(&known, Extras::default(), &mut traced);
+        let mut values = traced.log_stretch.iter().copied();
+        found.extend(is_known.into_iter().map(|known| if known { values.next().unwrap_or(f32::NAN) } else { f32::NAN }));
+    }
+    Ok(found)
 }
 
 /// Root mean square, from the mean square and its standard error added up: few points hold most of a difference.

@@ -2,7 +2,7 @@
 
 use crate::kit;
 use crate::kit::program::{ridgewatch, set, start, text, until};
-use crate::kit::scene::{double_gyre, run_frames, setup, write};
+use crate::kit::scene::{double_gyre, run_frames, scene as scene_of, setup, write};
 use ridgewatch::run::{ColorBar, Event, Frame, RunOptions, RunReport, Setup, Steering, run};
 use ridgewatch::steer::{Outcome, Steerer};
 use serde_json::{Value, json};
@@ -124,6 +124,23 @@ fn the_steps_of_the_integration_follow_tolerance_and_colours() {
         let residual = frames[number].record.integration_residual.unwrap();
         assert!(residual <= tolerance / 15.0, "frame {number}: {residual}");
     }
+}
+
+/// What fewer steps leave in a picture is measured for a new view once it stands, not while it moves.
+#[test]
+fn the_error_of_the_steps_is_that_of_the_view() {
+    let keys = "domain.min = [0, 0, 0]\ndomain.max = [6.283, 6.283, 6.283]\nflow.boundary = \"stop\"\ntime.tau = 4\ntime.slides = 1
+        time.frames_per_slide = 5\nsurrogate.kind = \"table\"\nrender.method = \"two_level\"\n";
+    let corner = json!({"eye": [0.2, 0.2, 5.0], "look_at": [0.2, 0.2, 0.0], "up": [0, 1, 0], "field_of_view": 5, "orthographic": true});
+    let (frames, _) = steered(setup(&scene_of("abc", [32, 24, 2], keys), &[]), |steering, frame| {
+        if frame.record.frame == 1 {
+            command(steering, json!({"camera": corner}));
+        }
+        false
+    });
+    let stated: Vec<f64> = frames.iter().map(|frame| frame.record.picture_error.unwrap().steps_rms).collect();
+    assert!(stated[0] > 0.0 && stated[..3].iter().all(|rms| *rms == stated[0]), "{stated:?}");
+    assert!(stated[3] != stated[0] && stated[4] == stated[3], "{stated:?}");
 }
 
 /// What a command sets is a decision no more, and what follows from it is decided anew.

@@ -302,6 +302,17 @@ mod tests {
         assert!((upper - half).abs() < 4.0 * (half / 2.0).sqrt(), "{upper} of {}", first_ones.len());
     }
 
+    #[test]
+    fn pixels_that_are_not_lit_have_an_error_of_their_own() {
+        let mut control = MarchControl::default();
+        // The nets lie 0.1 beside what is shown: at the edge of land, and in a lit pixel.
+        let pixel = |alpha: f64, net: f64| AuditedPixel { shown: [0.5, 0.5, 0.5, alpha], nets: [[net; 3]; 2], ..AuditedPixel::default() };
+        control.audit([pixel(0.0, 0.6), pixel(0.0, 0.5), pixel(1.0, 0.8)], ToneMap::new([1.0, 0.5, 1.0]));
+        let found = control.errors();
+        assert!((found.unlit[0] - 0.005).abs() < 1e-6 && found.unlit[1] > 0.0, "{found:?}");
+        assert!((found.squared[2] - 0.09).abs() < 1e-6, "{found:?}");
+    }
+
     /// After steps were halved, the statement rests on as many audits as at first.
     #[test]
     fn smaller_steps_are_audited_as_often() {
