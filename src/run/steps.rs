@@ -31,9 +31,9 @@ const TARGET_SHARE: f64 = 0.1;
 /// Pixels by which pictures are compared at first, and most if these do not tell; points of each of the two nets of a pixel.
 const PIXELS: usize = 512;
 const MOST_PIXELS: usize = 4 * PIXELS;
+const PER_NET: usize = 12;
 /// Points that are traced at once, after which a stop is looked for.
 const AT_ONCE: usize = 1 << 12;
-const PER_NET: usize = 12;
 /// Smallest share of the points on which something is to be seen.
 const MIN_SHOWN: f64 = 1.0 / 32.0;
 /// The residual at which steps are chosen again on a later slide, in units of the largest one of a choice: at more, pictures suffer, and at less,
@@ -112,8 +112,8 @@ impl PictureSteps {
 }
 
 /// Returns the first number of steps, each at most 1.25 times the one before or one snapshot interval more, whose optical residual is at most
-/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance and whose error in the picture is small enough, or those `chosen` for the log-stretch if it has none below them, if these are not within their own
-/// tolerance, or if too few points show anything to judge by (and there is no comparison).
+/// [`SHARE`] or [`FLAT_SHARE`] of the tolerance and whose error in the picture is small enough; or those `chosen` for the log-stretch if it has none below
+/// them, if these are not within their own tolerance, or if too few points show anything to judge by (and there is no comparison).
 ///
 /// # Errors
 /// As for [`cpu_tracer`], or a stop is requested.
