@@ -87,6 +87,11 @@ fn true_square(film: &Film, exact: &[[f64; 3]], weight: impl Fn(f64) -> f64) -> 
     lit.iter().flat_map(|&i| (0..3).map(move |k| (i, k))).map(|(i, k)| square(i, k)).sum::<f64>() / (3 * lit.len()) as f64
 }
 
+/// A round of a picture whose steps leave nothing in it.
+fn round(nodes: &Nodes, (method, sum): (Method, bool), samples: f64, number: u64) -> Refinement<'_> {
+    Refinement { nodes, missing: None, method, sum, samples, budget: None, steps_error: StepsError::default(), number, stop: &NEVER }
+}
+
 /// Numbers of pictures that state an error, whose interval holds the true one, is above it and below it.
 fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Method, bool), pairs_per_pixel: f64, rounds: u64) -> [usize; 4] {
     let exact = exact(traced, width);
@@ -96,17 +101,7 @@ fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Metho
         let mut last = None;
         for number in 0..rounds {
             let samples = 2.0 * pairs_per_pixel;
-            let round = Refinement {
-                nodes: surrogate,
-                missing: None,
-                method,
-                sum,
-                samples,
-                budget: None,
-                steps_error: StepsError::default(),
-                number,
-                stop: &NEVER,
-            };
+            let round = round(surrogate, (method, sum), samples, number);
             last = renderer.refine(&mut picture, &round, &mut Traced(traced));
         }
         let (film, _, error) = last.unwrap();
@@ -156,17 +151,7 @@ fn errors_of_pixels_hold() {
                 let mut renderer = renderer(WIDTH, 100 + seed);
                 let (mut picture, mut last) = (Picture::default(), None);
                 for number in 0..rounds {
-                    let round = Refinement {
-                        nodes: &surrogate,
-                        missing: None,
-                        method,
-                        sum: false,
-                        samples: 1.0,
-                        budget: None,
-                        steps_error: StepsError::default(),
-                        number,
-                        stop: &NEVER,
-                    };
+                    let round = round(&surrogate, (method, false), 1.0, number);
                     last = renderer.refine(&mut picture, &round, &mut Traced(&traced));
                 }
                 let film = last.unwrap().0;
@@ -197,17 +182,7 @@ fn a_target_is_reached_when_it_is_met() {
         let mut renderer = renderer(WIDTH, 100 + seed);
         let (mut picture, mut early) = (Picture::default(), None);
         for number in 0..400 {
-            let round = Refinement {
-                nodes: &surrogate,
-                missing: None,
-                method: Method::TwoLevel,
-                sum: false,
-                samples: 1.0,
-                budget: None,
-                steps_error: StepsError::default(),
-                number,
-                stop: &NEVER,
-            };
+            let round = round(&surrogate, (Method::TwoLevel, false), 1.0, number);
             let (film, _, error) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
             let missed = true_square(&film, &exact, |c| 1.0 / (c * c + 0.01)) / MOST;
             if error.relmse.value <= MOST {
@@ -233,17 +208,7 @@ fn a_sum_is_called_unbiased_once_every_pixel_has_samples() {
     let mut renderer = renderer(32, 5);
     let mut picture = Picture::default();
     let unbiased = [0, 1].map(|number| {
-        let round = Refinement {
-            nodes: &surrogate,
-            missing: None,
-            method: Method::TwoLevel,
-            sum: true,
-            samples: 1.0,
-            budget: None,
-            steps_error: StepsError::default(),
-            number,
-            stop: &NEVER,
-        };
+        let round = round(&surrogate, (Method::TwoLevel, true), 1.0, number);
         renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap().2.unbiased
     });
     assert_eq!(unbiased, [false, true]);
@@ -273,17 +238,7 @@ fn a_shrunk_correction_converges_with_its_samples() {
         let error_of = |number: i32| {
             let all = 4_f64.powi(number);
             let (method, samples) = (Method::TwoLevel, if number > 0 { 0.75 * all } else { all });
-            let round = Refinement {
-                nodes: &surrogate,
-                missing: None,
-                method,
-                sum,
-                samples,
-                budget: None,
-                steps_error: StepsError::default(),
-                number: number as u64,
-                stop: &NEVER,
-            };
+            let round = round(&surrogate, (method, sum), samples, number as u64);
             let (film, _, stated) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
             assert!((stated.samples_per_pixel / all - 1.0).abs() < 0.05, "{} samples, not {all}", stated.samples_per_pixel);
             true_square(&film, &exact, |_| 1.0).sqrt()
