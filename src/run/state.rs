@@ -40,7 +40,7 @@ pub(super) struct Run<'a> {
     pub(super) began: Instant,
     pub(super) report: &'a mut RunReport,
     pub(super) renderer: Renderer,
-    /// The flow map as the scene and commands ask for it; [`Cycle::map`] is what came of it.
+    /// The flow map as the scene and commands ask for it; [`super::cycle::Cycle::map`] is what came of it.
     pub(super) asked: FlowMap,
     /// `[render]` with the method and the budget that commands set.
     pub(super) render: RenderSettings,

@@ -350,7 +350,7 @@ impl Picture {
         let (of_tiles, across) = (errors_of_tiles(&tiles), width.div_ceil(TILE));
         let of_pixel = |(i, colour): (usize, &[f32; 4])| {
             let is_lit = colour[3] > LIT;
-            // Pixels that are not lit have hardly any of march and steps.
+            // Those that are not lit have hardly any of it but at the edges of land, which are few.
             let marched = if is_lit { (march + steps.squared[0]) as f32 } else { 0.0 };
             (error_at(&of_tiles, across, [i % width, i / width], is_lit) + marched).sqrt()
         };

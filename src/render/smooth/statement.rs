@@ -26,6 +26,13 @@ impl ErrorEstimate {
     fn map(self, f: impl Fn(f64) -> f64) -> Self {
         Self { value: f(self.value), low: f(self.low), high: f(self.high) }
     }
+
+    /// Adds an independent mean square error, of which the mean and its standard error are given. Its own interval reaches two of these from the mean.
+    fn plus(self, [squared, deviation]: [f64; 2]) -> Self {
+        let value = self.value + squared;
+        let (below, above) = ((self.value - self.low).hypot(2.0 * deviation), (self.high - self.value).hypot(2.0 * deviation));
+        Self { value, low: (value - below).max(0.0), high: value + above }
+    }
 }
 
 /// Mean square error of marching over channels, in the weightings of [`TileErrors`].
@@ -39,26 +46,10 @@ pub struct MarchError {
     pub unlit: [f64; 2],
 }
 
-impl MarchError {
-    /// Adds the error of marching over lit pixels to another mean square error.
-    fn added_to(&self, other: ErrorEstimate, weighting: usize) -> ErrorEstimate {
-        other.plus([self.squared[weighting], self.deviation[weighting]])
-    }
-}
-
-impl ErrorEstimate {
-    /// Adds an independent mean square error, of which the mean and its standard error are given. Its own interval reaches two of these from the mean.
-    fn plus(self, [squared, deviation]: [f64; 2]) -> Self {
-        let value = self.value + squared;
-        let (below, above) = ((self.value - self.low).hypot(2.0 * deviation), (self.high - self.value).hypot(2.0 * deviation));
-        Self { value, low: (value - below).max(0.0), high: value + above }
-    }
-}
-
 /// Mean square error of a picture's Runge-Kutta steps over lit pixels and channels, in the weightings of [`TileErrors`]; 0: not measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct StepsError {
-    /// Mean over rays.
+    /// Mean over compared pixels.
     pub squared: [f64; 3],
     /// Its standard error.
     pub deviation: [f64; 3],
@@ -169,8 +160,8 @@ impl PictureError {
     /// Error of a picture from its tiles and the errors of its march and its Runge-Kutta steps.
     pub fn of(tiles: &[TileSums], march: &MarchError, steps: &StepsError, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
         let lit = |weighting: usize| {
-            march
-                .added_to(estimate(tiles.iter().map(|tile| &tile.lit), weighting), weighting)
+            estimate(tiles.iter().map(|tile| &tile.lit), weighting)
+                .plus([march.squared[weighting], march.deviation[weighting]])
                 .plus([steps.squared[weighting], steps.deviation[weighting]])
         };
         let pixels = |of: fn(&TileSums) -> f32| tiles.iter().map(|tile| f64::from(of(tile))).sum::<f64>();
@@ -331,12 +322,12 @@ mod tests {
     fn the_error_of_marching_counts_in_its_own_weighting() {
         let march = MarchError { squared: [4.0, 8.0, 2.0], deviation: [1.0, 2.0, 0.5], ..MarchError::default() };
         let none = ErrorEstimate::default();
-        let found = [0, 1, 2].map(|weighting| march.added_to(none, weighting));
+        let found = [0, 1, 2].map(|weighting| none.plus([march.squared[weighting], march.deviation[weighting]]));
         let interval = |value, low, high| ErrorEstimate { value, low, high };
         assert_eq!(found, [interval(4.0, 2.0, 6.0), interval(8.0, 4.0, 12.0), interval(2.0, 1.0, 3.0)]);
         // Independent errors: half-widths are added in squares.
         let other = ErrorEstimate { value: 10.0, low: 8.5, high: 10.0 };
-        assert_eq!(march.added_to(other, 0), interval(14.0, 11.5, 16.0));
+        assert_eq!(other.plus([march.squared[0], march.deviation[0]]), interval(14.0, 11.5, 16.0));
         assert_eq!(other.plus([0.0; 2]), other);
     }
 
