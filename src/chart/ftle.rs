@@ -512,7 +512,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize, place: &str) -> Result<(), 
         let what = format!("composed flow maps of {} nodes", shape(nodes));
         // Joining keeps half as many tables beside the others.
         let count = nodes.iter().product::<usize>();
-        if !fits(bench, &what, count, 3 * count * (intervals + intervals.div_ceil(2))) {
+        if !fits(bench, &what, count, Composition::MOST_VALUES * count * (intervals + intervals.div_ceil(2))) {
             continue;
         }
         let began = Instant::now();
@@ -520,7 +520,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize, place: &str) -> Result<(), 
         let per_interval = steps.div_ceil(intervals);
         let built = bench.charting.pool.install(|| Composition::trace(velocity, map, time, nodes, intervals, per_interval));
         let Some(plain) = built.map_err(RunError::Flow)? else {
-            bench.charting.skip("composition", "only on Cartesian grids, and only if particles never stop or wrap");
+            bench.charting.skip("composition", "not if particles wrap, leave with an FTLE of 0, or have durations of their own");
             return Ok(());
         };
         let plain_seconds = began.elapsed().as_secs_f64();

@@ -2,33 +2,54 @@
 //! 017503, 2010): the displacement over each interval of time is traced once at nodes and interpolated, so that a window that slides traces one
 //! interval only.
 
+use super::axis_map::AxisMap;
+use super::sphere::{Globe, GlobeLocation, dot, normalised, project, trigonometry};
 use super::stretch::log_stretch;
-use super::{Boundary, Extras, FlowError, FlowMap, Normalisation, Traced, VelocitySource, cpu_tracer};
+use super::{Boundary, Extras, FlowError, FlowMap, Normalisation, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use rayon::prelude::*;
-use ridgewatch_field::{Domain, DomainPoint, Geometry, UnitPoint};
+use ridgewatch_field::{Axis, Domain, DomainPoint, Geometry, UnitPoint};
 
 /// Nodes traced at once, which bounds the memory beside the tables.
 const AT_ONCE: usize = 1 << 20;
 /// Points per parallel task.
 const CHUNK: usize = 1 << 10;
+/// Most components of a state, and most values of a node.
+const STATE: usize = 4;
+const VALUES: usize = Composition::MOST_VALUES;
+/// Share of an interval from which on a particle did not stop in it, but for rounding.
+const SURVIVES: f64 = 1.0 - 1e-5;
 
-/// Displacement over one interval in unit coordinates, at nodes of a regular grid over the unit domain, x fastest.
-#[derive(Debug, Clone)]
-struct DisplacementTable(Vec<[f32; 3]>);
+/// Place of a particle: unit coordinates, or on a sphere a unit vector and, with levels, the height in unit coordinates.
+type State = [f64; STATE];
 
 /// A chain of tabulated flow maps, one per interval of time, earliest first.
 #[derive(Debug, Clone)]
 pub struct Composition {
-    /// Nodes along x, y, z; one along z in two dimensions.
+    /// Nodes along x, y, z, of a regular grid over the domain, x fastest; one along z in two dimensions.
     nodes: [usize; 3],
     domain: Domain,
-    tables: Vec<DisplacementTable>,
+    sphere: Option<Sphere>,
+    /// True if the last value of a node is the share of the interval after which its particle stops; 1: it does not.
+    stops: bool,
+    /// Displacement of the state over an interval, of each node.
+    tables: Vec<Vec<f32>>,
+}
+
+/// A sphere on whose longitudes and latitudes the nodes lie.
+#[derive(Debug, Clone)]
+struct Sphere {
+    /// Locates directions among the nodes.
+    globe: Globe<f64>,
+    radius: f64,
 }
 
 impl Composition {
+    /// Most values of a node: a displacement on a sphere with levels, and a share of the interval.
+    pub const MOST_VALUES: usize = STATE + 1;
+
     /// Traces the displacements over `intervals` equal parts of tau, with the interpolation, boundary and direction of `map`, and `steps` Runge-Kutta
-    /// steps per part. `None` on a sphere, where a displacement in degrees jumps at the dateline and the poles, and if particles stop or wrap, which
-    /// the displacement does not tell.
+    /// steps per part. A particle that stops in an interval keeps the stretch that it has at its end. `None` if particles wrap, leave with an FTLE of 0
+    /// or have their own durations, which the displacement does not tell.
     ///
     /// # Errors
     /// As [`cpu_tracer`].
@@ -40,72 +61,110 @@ impl Composition {
         intervals: usize,
         steps: usize,
     ) -> Result<Option<Self>, FlowError> {
-        if let VelocitySource::Window(window) = velocity
-            && window.grid().is_some_and(|grid| grid.geometry != Geometry::Cartesian)
-        {
-            return Ok(None);
-        }
-        if !matches!(map.boundary, Boundary::Clamp | Boundary::Unbounded) || map.normalisation == Normalisation::Lifetime {
+        if matches!(map.boundary, Boundary::Periodic | Boundary::Zero) || map.normalisation == Normalisation::Lifetime {
             return Ok(None);
         }
         let part = map.tau / intervals.max(1) as f64;
-        let map = FlowMap { tau: part, steps: super::Steps::Fixed(steps.max(1)), ..map.clone() };
+        let map = FlowMap { tau: part, steps: Steps::Fixed(steps.max(1)), ..map.clone() };
+        let radius = match velocity {
+            VelocitySource::Window(window) => window.grid().and_then(|grid| match grid.geometry {
+                Geometry::Cartesian => None,
+                Geometry::Sphere { radius } => Some(radius),
+            }),
+            VelocitySource::Analytic(..) => None,
+        };
         let mut composition: Option<Self> = None;
         for interval in 0..intervals.max(1) {
             let tracer = cpu_tracer(velocity.clone(), &map, t0 + map.direction.sign() * part * interval as f64)?;
-            let built = composition.get_or_insert_with(|| {
-                let domain = tracer.domain().clone();
-                let nodes = std::array::from_fn(|axis| if axis < domain.dimensions { nodes[axis].max(2) } else { 1 });
-                Self { nodes, domain, tables: Vec::new() }
-            });
-            let mut table = vec![[0.0; 3]; built.nodes.iter().product()];
-            let mut traced = Traced::default();
-            for (number, displacements) in table.chunks_mut(AT_ONCE).enumerate() {
-                let unit: Vec<UnitPoint> = (0..displacements.len()).into_par_iter().map(|i| built.unit(number * AT_ONCE + i)).collect();
-                let seeds: Vec<DomainPoint> = unit.par_iter().map(|&point| built.domain.from_unit(point)).collect();
-                tracer.trace(&seeds, Extras { arrival: true, jacobian: false }, &mut traced);
-                for ((displacement, arrival), seed) in displacements.iter_mut().zip(&traced.arrival).zip(&unit) {
-                    let arrival = built.domain.to_unit_unclamped(*arrival);
-                    // Missing cells have no arrival; a particle rests there.
-                    *displacement = std::array::from_fn(|axis| {
-                        let moved = arrival.0[axis] - seed.0[axis];
-                        if moved.is_finite() && axis < built.domain.dimensions { moved } else { 0.0 }
-                    });
-                }
-            }
-            built.tables.push(DisplacementTable(table));
+            let built = composition.get_or_insert_with(|| Self::empty(tracer.domain(), radius, map.boundary == Boundary::Stop, nodes));
+            let table = built.traced(&*tracer);
+            built.tables.push(table);
         }
         Ok(composition)
+    }
+
+    fn empty(domain: &Domain, radius: Option<f64>, stops: bool, nodes: [usize; 3]) -> Self {
+        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < domain.dimensions { nodes[axis].max(2) } else { 1 });
+        let axis =
+            |k: usize| Axis::uniform("", "", domain.min[k], domain.max[k], nodes[k]).map(|axis| AxisMap::new(&axis, Boundary::Clamp));
+        // A domain has an extent along each of its axes.
+        let globe = radius.and_then(|radius| Some(Sphere { globe: Globe::new(&axis(0).ok()?, &axis(1).ok()?), radius }));
+        Self { nodes, domain: domain.clone(), sphere: globe, stops, tables: Vec::new() }
+    }
+
+    /// Displacements over the interval of a tracer.
+    fn traced(&self, tracer: &dyn Tracer) -> Vec<f32> {
+        let (components, values) = (self.components(), self.values());
+        let mut table = vec![0.0; values * self.nodes.iter().product::<usize>()];
+        let mut traced = Traced::default();
+        for (number, rows) in table.chunks_mut(values * AT_ONCE).enumerate() {
+            let first = number * AT_ONCE;
+            let unit: Vec<UnitPoint> = (first..first + rows.len() / values).into_par_iter().map(|node| self.unit(node)).collect();
+            let seeds: Vec<DomainPoint> = unit.par_iter().map(|&point| self.domain.from_unit(point)).collect();
+            tracer.trace(&seeds, Extras { arrival: true, jacobian: false }, &mut traced);
+            let arrived = traced.arrival.iter().zip(&traced.lifetime_share);
+            for ((row, seed), (arrival, share)) in rows.chunks_exact_mut(values).zip(&unit).zip(arrived) {
+                let (from, to) = (self.state(*seed), self.state(self.domain.to_unit_unclamped(*arrival)));
+                // Missing cells have no arrival; a particle rests there.
+                let is_known = to.iter().all(|x| x.is_finite());
+                for i in 0..components {
+                    row[i] = if is_known { (to[i] - from[i]) as f32 } else { 0.0 };
+                }
+                if self.stops {
+                    row[components] = if is_known && share.is_finite() { *share } else { 0.0 };
+                }
+            }
+        }
+        table
     }
 
     /// Joins neighbouring intervals until one is left (the hierarchical variant): a sample then takes one look-up instead of one per interval.
     /// Each joining interpolates once more.
     #[must_use]
     pub fn joined(&self) -> Self {
-        let join = |tables: &[DisplacementTable]| tables.chunks(2).map(|pair| self.join(pair)).collect::<Vec<_>>();
+        let join = |tables: &[Vec<f32>]| tables.chunks(2).map(|pair| self.join(pair)).collect::<Vec<_>>();
         let mut tables = join(&self.tables);
         while tables.len() > 1 {
             tables = join(&tables);
         }
-        Self { nodes: self.nodes, domain: self.domain.clone(), tables }
+        Self { tables, ..self.clone() }
     }
 
-    fn join(&self, pair: &[DisplacementTable]) -> DisplacementTable {
-        let mut first = pair[0].clone();
-        if let Some(second) = pair.get(1) {
-            first.0.par_iter_mut().enumerate().for_each(|(node, displacement)| {
-                let from = self.unit(node).0.map(f64::from);
-                let there: [f64; 3] = std::array::from_fn(|axis| from[axis] + f64::from(displacement[axis]));
-                let (further, _) = self.interpolate(second, there);
-                *displacement = std::array::from_fn(|axis| (f64::from(displacement[axis]) + further[axis]) as f32);
-            });
-        }
-        first
+    fn join(&self, pair: &[Vec<f32>]) -> Vec<f32> {
+        let mut joint = pair[0].clone();
+        let Some(second) = pair.get(1) else { return joint };
+        let components = self.components();
+        joint.par_chunks_exact_mut(self.values()).enumerate().for_each(|(node, row)| {
+            let from = self.state(self.unit(node));
+            let mut at: State = std::array::from_fn(|i| if i < components { from[i] + f64::from(row[i]) } else { 0.0 });
+            if self.stops && row[components] < SURVIVES as f32 {
+                return;
+            }
+            let (value, _) = self.interpolate(second, self.place(&at).nodes);
+            self.advance::<0>(&mut at, &mut [[]; STATE], &value);
+            for i in 0..components {
+                row[i] = (at[i] - from[i]) as f32;
+            }
+            if self.stops {
+                row[components] = value[components] as f32;
+            }
+        });
+        joint
     }
 
     /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
-        self.tables.len() * self.nodes.iter().product::<usize>() * size_of::<[f32; 3]>()
+        self.tables.iter().map(|table| size_of_val(&table[..])).sum()
+    }
+
+    /// Components of a state that particles change.
+    fn components(&self) -> usize {
+        if self.sphere.is_some() { 3 + usize::from(self.domain.dimensions == 3) } else { self.domain.dimensions.clamp(2, 3) }
+    }
+
+    /// Values of a node.
+    fn values(&self) -> usize {
+        self.components() + usize::from(self.stops)
     }
 
     /// Unit coordinates of a node. Two-dimensional flows are traced in the middle of the slab.
@@ -115,36 +174,124 @@ impl Composition {
         UnitPoint(std::array::from_fn(|axis| if self.nodes[axis] > 1 { index[axis] as f32 / (self.nodes[axis] - 1) as f32 } else { 0.5 }))
     }
 
-    /// Interpolated displacement at a unit point and its derivatives, `[component][axis]`. Outside the domain both are those at its edge.
-    fn interpolate(&self, table: &DisplacementTable, point: [f64; 3]) -> ([f64; 3], [[f64; 3]; 3]) {
-        let [nx, ny, _] = self.nodes;
-        let axes = self.domain.dimensions.clamp(2, 3);
-        let (mut low, mut fraction, mut cells) = ([0; 3], [0.0; 3], [0.0; 3]);
-        for axis in 0..axes {
-            cells[axis] = (self.nodes[axis] - 1) as f64;
-            let position = point[axis].clamp(0.0, 1.0) * cells[axis];
-            low[axis] = (position as usize).min(self.nodes[axis] - 2);
-            fraction[axis] = position - low[axis] as f64;
+    /// Sine and cosine of longitude and latitude of a unit point on the sphere.
+    fn trigonometry(&self, point: UnitPoint) -> [f64; 4] {
+        let extent = self.domain.extent();
+        trigonometry(std::array::from_fn(|k| self.domain.min[k] + extent[k] * f64::from(point.0[k])))
+    }
+
+    fn state(&self, point: UnitPoint) -> State {
+        let [x, y, z] = point.0.map(f64::from);
+        if self.sphere.is_none() {
+            return [x, y, z, 0.0];
         }
-        let (mut value, mut derivative) = ([0.0; 3], [[0.0; 3]; 3]);
+        let [sin_lon, cos_lon, sin_lat, cos_lat] = self.trigonometry(point);
+        [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat, z]
+    }
+
+    /// d state / d seed along an orthonormal basis at the seed, lengths in units of the domain, or in radii.
+    fn initial_tangent<const C: usize>(&self, point: UnitPoint) -> [[f64; C]; STATE] {
+        let extent = self.domain.extent();
+        let full = match &self.sphere {
+            None => [[1.0 / extent[0], 0.0, 0.0], [0.0, 1.0 / extent[1], 0.0], [0.0, 0.0, 1.0 / extent[2]], [0.0; 3]],
+            Some(Sphere { radius, .. }) => {
+                let [sin_lon, cos_lon, sin_lat, cos_lat] = self.trigonometry(point);
+                [
+                    [-sin_lon, -sin_lat * cos_lon, 0.0],
+                    [cos_lon, -sin_lat * sin_lon, 0.0],
+                    [0.0, cos_lat, 0.0],
+                    [0.0, 0.0, radius / extent[2]],
+                ]
+            }
+        };
+        full.map(|row| std::array::from_fn(|c| row[c]))
+    }
+
+    /// Gradient of the flow map between orthonormal bases at seed and arrival.
+    fn gradient<const C: usize>(&self, at: &State, tangent: &[[f64; C]; STATE]) -> [[f64; C]; C] {
+        let extent = self.domain.extent();
+        let Some(Sphere { globe, radius }) = &self.sphere else {
+            return std::array::from_fn(|i| tangent[i].map(|x| x * extent[i]));
+        };
+        let p = [at[0], at[1], at[2]];
+        let basis = globe.basis(&p, globe.locate(&p).cosine);
+        std::array::from_fn(|i| {
+            std::array::from_fn(|c| match i {
+                0 | 1 => dot(&basis[i], &[tangent[0][c], tangent[1][c], tangent[2][c]]),
+                _ => tangent[3][c] * extent[2] / radius,
+            })
+        })
+    }
+
+    fn place(&self, at: &State) -> Place {
+        // Outside the domain displacement and derivatives are those at its edge.
+        let within = |x: f64, axis: usize| x.clamp(0.0, 1.0) * (self.nodes[axis] - 1) as f64;
+        match &self.sphere {
+            None => Place { nodes: std::array::from_fn(|axis| within(at[axis], axis)), on_sphere: None },
+            Some(Sphere { globe, .. }) => {
+                let here = globe.locate(&[at[0], at[1], at[2]]);
+                let [longitude, latitude] = [0, 1].map(|axis| here.location[axis].clamp(0.0, (self.nodes[axis] - 1) as f64));
+                Place { nodes: [longitude, latitude, within(at[3], 2)], on_sphere: Some(here) }
+            }
+        }
+    }
+
+    /// Interpolated values among the nodes and their derivatives along the axes, per node.
+    fn interpolate(&self, table: &[f32], place: [f64; 3]) -> ([f64; VALUES], [[f64; 3]; VALUES]) {
+        let ([nx, ny, _], values) = (self.nodes, self.values());
+        let axes = self.domain.dimensions.clamp(2, 3);
+        let (mut low, mut fraction) = ([0; 3], [0.0; 3]);
+        for axis in 0..axes {
+            low[axis] = (place[axis] as usize).min(self.nodes[axis] - 2);
+            fraction[axis] = place[axis] - low[axis] as f64;
+        }
+        let (mut value, mut derivative) = ([0.0; VALUES], [[0.0; 3]; VALUES]);
         for corner in 0..1 << axes {
             let high = |axis: usize| corner >> axis & 1;
             let weight = |axis: usize| if high(axis) == 1 { fraction[axis] } else { 1.0 - fraction[axis] };
             let node = (low[0] + high(0)) + nx * ((low[1] + high(1)) + ny * (if axes == 3 { low[2] + high(2) } else { 0 }));
-            let displacement = table.0[node].map(f64::from);
+            let row = &table[values * node..values * (node + 1)];
             let all: f64 = (0..axes).map(weight).product();
+            let mut slopes = [0.0; 3];
             for axis in 0..axes {
                 let others: f64 = (0..axes).filter(|&k| k != axis).map(weight).product();
-                let slope = if high(axis) == 1 { others * cells[axis] } else { -others * cells[axis] };
-                for component in 0..axes {
-                    derivative[component][axis] += displacement[component] * slope;
-                }
+                slopes[axis] = if high(axis) == 1 { others } else { -others };
             }
-            for component in 0..axes {
-                value[component] += displacement[component] * all;
+            for (i, &entry) in row.iter().enumerate() {
+                value[i] += f64::from(entry) * all;
+                for axis in 0..axes {
+                    derivative[i][axis] += f64::from(entry) * slopes[axis];
+                }
             }
         }
         (value, derivative)
+    }
+
+    /// Changes of the place among the nodes for a change of the state.
+    fn differentials(&self, place: &Place, change: State) -> [f64; 3] {
+        let cells = self.nodes.map(|n| (n.max(2) - 1) as f64);
+        match (&self.sphere, &place.on_sphere) {
+            (Some(Sphere { globe, .. }), Some(here)) => {
+                let basis = globe.basis(&here.p, here.cosine);
+                let (_, [longitude, latitude]) = globe.differentials(here, &basis, [change[0], change[1], change[2]]);
+                [longitude, latitude, change[3] * cells[2]]
+            }
+            _ => std::array::from_fn(|axis| change[axis] * cells[axis]),
+        }
+    }
+
+    /// Adds a displacement to a state, and what was added to its tangent too; both stay on the sphere.
+    fn advance<const C: usize>(&self, at: &mut State, tangent: &mut [[f64; C]; STATE], value: &[f64; VALUES]) {
+        (0..self.components()).for_each(|i| at[i] += value[i]);
+        if self.sphere.is_none() {
+            return;
+        }
+        let (p, inverse) = normalised(&[at[0], at[1], at[2]]);
+        at[..3].copy_from_slice(&p);
+        for c in 0..C {
+            let (column, _) = project(&p, &[tangent[0][c], tangent[1][c], tangent[2][c]]);
+            (0..3).for_each(|i| tangent[i][c] = column[i] * inverse);
+        }
     }
 
     /// Writes the log-stretch at unit points into `out` (same length).
@@ -156,23 +303,30 @@ impl Composition {
         });
     }
 
-    fn stretch_at<const D: usize>(&self, point: UnitPoint) -> f64 {
-        let mut at = point.0.map(f64::from);
-        let mut jacobian: [[f64; D]; D] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
+    fn stretch_at<const C: usize>(&self, point: UnitPoint) -> f64 {
+        let (mut at, mut tangent, components) = (self.state(point), self.initial_tangent::<C>(point), self.components());
         for table in &self.tables {
-            let (displacement, derivative) = self.interpolate(table, at);
-            let before = jacobian;
-            for i in 0..D {
-                for j in 0..D {
-                    jacobian[i][j] = before[i][j] + (0..D).map(|k| derivative[i][k] * before[k][j]).sum::<f64>();
+            let place = self.place(&at);
+            let (value, derivative) = self.interpolate(table, place.nodes);
+            for c in 0..C {
+                let change = self.differentials(&place, std::array::from_fn(|i| tangent[i][c]));
+                for i in 0..components {
+                    tangent[i][c] += (0..3).map(|axis| derivative[i][axis] * change[axis]).sum::<f64>();
                 }
-                at[i] += displacement[i];
+            }
+            self.advance(&mut at, &mut tangent, &value);
+            if self.stops && value[components] < SURVIVES {
+                break;
             }
         }
-        let extent = self.domain.extent();
-        let in_coordinates: [[f64; D]; D] = std::array::from_fn(|i| std::array::from_fn(|j| jacobian[i][j] * extent[i] / extent[j]));
-        log_stretch(&in_coordinates)
+        log_stretch(&self.gradient(&at, &tangent))
     }
+}
+
+/// A place among the nodes: node coordinates from the first node on, and the location on the sphere.
+struct Place {
+    nodes: [f64; 3],
+    on_sphere: Option<GlobeLocation<f64>>,
 }
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! Flows on the sphere and over its poles, with and without levels, whose stretch is known.
 
 use crate::kit::flow::{DAY, EVERYTHING, cross, direction, dot, rotation, trace};
-use ridgewatch::field::{Axis, DomainPoint, EARTH_RADIUS, Geometry, Grid, Snapshot, Window};
-use ridgewatch::flow::{Boundary, FlowMap, Integrator, Interpolation, Precision, Traced, VelocitySource};
+use ridgewatch::field::{Axis, DomainPoint, EARTH_RADIUS, Geometry, Grid, Snapshot, UnitPoint, Window};
+use ridgewatch::flow::{Boundary, Composition, FlowMap, Integrator, Interpolation, Precision, Traced, VelocitySource};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
@@ -281,5 +281,83 @@ fn zonal_shear_on_the_sphere_has_a_closed_form() {
         println!("zonal shear, {integrator:?}, {precision:?}: max {max:.1e}");
         // Interpolation in cells of half a degree: derivatives are off by the square of a cell, 8e-5, of a g of up to 5.
         assert!(max < 5e-4, "{max:e}");
+    }
+}
+
+/// Root mean square errors of composed flow maps, plain and hierarchical, at seeds of a globe.
+fn composed(source: &VelocitySource, tau: f64, nodes: [usize; 3], seeds: &[DomainPoint], expected: &[f64]) -> [f64; 2] {
+    let map = map(tau, 100, Precision::F64, Interpolation::Cubic);
+    let plain = Composition::trace(source, &map, 0.0, nodes, 4, 25).unwrap().unwrap();
+    let unit: Vec<UnitPoint> =
+        seeds.iter().map(|DomainPoint([x, y, z])| UnitPoint([x / 360.0, (y + 90.0) / 180.0, z / TOP as f32])).collect();
+    [plain.clone(), plain.joined()].map(|composition| {
+        let mut found = vec![0.0; unit.len()];
+        composition.log_stretch(&unit, &mut found);
+        let square: f64 = found.iter().zip(expected).map(|(a, b)| (a - b).powi(2)).sum();
+        (square / expected.len() as f64).sqrt()
+    })
+}
+
+#[test]
+fn composed_maps_go_over_poles_and_the_dateline() {
+    let tau = 10.0 * DAY;
+    // Solid rotation over the poles, a shear of circles of latitude, and rotation that turns faster above and rises.
+    let (b, c, r, middle) = (1.0 / tau, 3.0 / tau / EARTH_RADIUS, -0.4 / tau, TOP / 2.0);
+    let (e, k) = ((r * tau).exp(), ((r * tau).exp() - 1.0) / r);
+    let speed = 40.0;
+    let solid = globe(1.0, 1, tau, |lon, lat, _| {
+        let [u, v] = rotation(TAU / 4.0 / tau, TILT, lon, lat);
+        [u, v, 0.0]
+    });
+    let zonal = globe(1.0, 1, tau, |_, lat, _| [speed * lat.cos() * lat.sin(), 0.0, 0.0]);
+    let rising = globe(1.0, 9, tau, |lon, lat, z| {
+        let [u, v] = rotation(b + c * (z - middle), TILT, lon, lat);
+        [u, v, r * (z - middle)]
+    });
+    let seeds = seeds(400);
+    let axis = [TILT.sin(), 0.0, TILT.cos()];
+    let of = |stretch: &dyn Fn(&DomainPoint) -> f64| seeds.iter().map(stretch).collect::<Vec<f64>>();
+    let in_zones = |seed: &DomainPoint| sheared(speed / EARTH_RADIUS * f64::from(seed.0[1]).to_radians().cos().powi(2) * tau, 1.0);
+    let in_heights = |seed: &DomainPoint| sheared(EARTH_RADIUS * c * k * (1.0 - dot(vector(*seed), axis).powi(2)).sqrt(), e);
+    for (name, source, levels, expected) in
+        [("solid", &solid, 1, of(&|_| 0.0)), ("zonal", &zonal, 1, of(&in_zones)), ("rising", &rising, 9, of(&in_heights))]
+    {
+        let [coarse, fine] = [2usize, 1].map(|cell| composed(source, tau, [360 / cell + 1, 180 / cell + 1, levels], &seeds, &expected));
+        println!("composed, {name}: rms off by {coarse:?} with nodes of 2 degrees, {fine:?} with 1");
+        for kind in 0..2 {
+            // Gradients of linear interpolation are of first order.
+            assert!(fine[kind] < 0.65 * coarse[kind] && fine[kind] < 0.01, "{name}: {coarse:?} {fine:?}");
+        }
+    }
+}
+
+#[test]
+fn composed_maps_keep_what_stops() {
+    // x grows as exp(a t). Particles rise by 2 t - 2 t^2, up and down again, and those of the upper half stop at the top on the way: where x is 0,
+    // ln stretch is a t at that time, a quadratic equation, and a tau for the others.
+    let (a, tau) = (2.0, 1.0);
+    let axis = |name: &str, low: f64, nodes: usize| Axis::uniform(name, "m", low, 1.0, nodes).unwrap();
+    let axes = vec![axis("x", -1.0, 33), axis("y", 0.0, 3), axis("z", 0.0, 17)];
+    let grid = Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+    let u: Vec<f32> = (0..grid.nodes()).map(|i| (a * grid.axes[0].coordinates()[i % 33]) as f32).collect();
+    let v = vec![0.0; u.len()];
+    let mut window = Window::new(tau);
+    for (time, w) in [(0.0, 2.0), (tau, -2.0)] {
+        window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &v, &vec![w; u.len()]))).unwrap();
+    }
+    let map = map(tau, 200, Precision::F64, Interpolation::Linear);
+    let source = VelocitySource::Window(Arc::new(window));
+    let plain = Composition::trace(&source, &map, 0.0, [129, 3, 65], 8, 25).unwrap().unwrap();
+    // Between them the stretch jumps.
+    let heights = (0..40).map(|i| (i as f32 + 0.5) / 40.0).filter(|z| (z - 0.5).abs() > 0.05);
+    let unit: Vec<UnitPoint> = heights.map(|z| UnitPoint([0.5, 0.5, z])).collect();
+    for composition in [plain.clone(), plain.joined()] {
+        let mut found = vec![0.0; unit.len()];
+        composition.log_stretch(&unit, &mut found);
+        for (point, found) in unit.iter().zip(found) {
+            let z = f64::from(point.0[2]);
+            let expected = if z < 0.5 { a * tau } else { a * 0.5 * (1.0 - (2.0 * z - 1.0).sqrt()) };
+            assert!((found - expected).abs() < 0.05, "{point:?}: {found}, {expected}");
+        }
     }
 }
