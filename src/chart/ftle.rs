@@ -29,6 +29,9 @@ const MAX_POINTS: usize = 1 << 20;
 const MIN_POINTS: usize = 1 << 10;
 /// Share of the panel's time for the truth.
 const TRUTH_SHARE: f64 = 0.2;
+/// Share of what is left of a GPU's time for networks, before what runs on the CPU.
+#[cfg(feature = "cuda")]
+const NETWORKS_SHARE: f64 = 0.75;
 /// Seconds over which the speed of a method is measured.
 const TIMED: f64 = 0.25;
 /// Fewest points of a timed batch, and most on the CPU and on a GPU.
@@ -256,6 +259,16 @@ struct Built {
 }
 
 impl Bench<'_, '_> {
+    /// As [`Charting::with_share`].
+    #[cfg(feature = "cuda")]
+    fn with_share<T>(&mut self, share: f64, work: impl FnOnce(&mut Self) -> T) -> T {
+        let whole = self.charting.ends;
+        self.charting.ends = Instant::now() + whole.saturating_duration_since(Instant::now()).mul_f64(share);
+        let result = work(self);
+        self.charting.ends = whole;
+        result
+    }
+
     /// Measures error and speed of a method. `answer` gives the log-stretch at points, `seconds` the time that points take.
     fn measure(
         &mut self,
@@ -382,13 +395,12 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             }
             tables(&mut bench, &mut backend)?;
             differences(&mut bench, &mut backend, steps)?;
+            bench.with_share(NETWORKS_SHARE, |bench| networks(bench, &mut backend))?;
             // They have no kernels.
             let chosen = FlowMap { steps: Steps::Fixed(steps), ..opened.plan.map.clone() };
             bench.time_nodes_by(&*opened.on_cpu(&chosen)?);
             composed(&mut bench, steps, ON_THE_CPU)?;
             adaptive(&mut bench, ON_THE_CPU)?;
-            bench.nodes_per_second = None;
-            networks(&mut bench, &mut backend)?;
         }
     }
     let mut panel = FtlePanel {
@@ -594,8 +606,9 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
         ("network", Kind::Network, own, suited),
         ("network", Kind::Network, own, if is_gpu { frequency } else { narrow }),
     ];
+    // The large ones of both kinds come first, in case that time ends.
     if let Some(small) = small {
-        variants.insert(1, ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()));
+        variants.insert(2, ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()));
         variants.insert(3, ("network", Kind::Network, own, small));
     }
     variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
