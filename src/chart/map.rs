@@ -2,7 +2,7 @@
 //! record of a map states it.
 
 use super::ftle::Opened;
-use super::picture::{LONGEST, PictureCurve, PictureErrors, SLIDES, Truth, Windows, decibels, measure, sliding, truth};
+use super::picture::{LONGEST, PictureCurve, PictureErrors, RESOLVED, SLIDES, Truth, Windows, decibels, measure, sliding, truth};
 use super::still::colours_of;
 use super::{Charting, with_method};
 use crate::flow::StepsSetting;
@@ -15,8 +15,8 @@ const TRUTH_SHARES: [f64; 2] = [0.05, 0.02];
 /// The same for the frames.
 const FRAMES_SHARE: f64 = 0.1;
 
-/// The curve of the flow's map; `None` if there is no time for it, or it is refused.
-pub(super) fn curve(charting: &mut Charting<'_>, opened: &Opened, windows: &Windows<'_>) -> Result<Option<PictureCurve>, RunError> {
+/// The curve of the flow's map, and the PSNR of its truth in decibels; `None` if there is no time for it, or it is refused.
+pub(super) fn curve(charting: &mut Charting<'_>, opened: &Opened, windows: &Windows<'_>) -> Result<Option<(PictureCurve, f64)>, RunError> {
     let mut curve = PictureCurve::new(Method::Map, Kind::Table);
     if !charting.has_time_for("pictures by map") {
         return Ok(None);
@@ -42,25 +42,26 @@ pub(super) fn curve(charting: &mut Charting<'_>, opened: &Opened, windows: &Wind
     let mut measured = || {
         let still = truth(0)?;
         if !still.mean.ftle_mean.iter().any(|ftle| ftle.is_finite()) {
-            return Ok(false);
+            return Ok(None);
         }
-        measure(windows, &scene, &still, 0.8 * longest, &mut curve.frames).map(|_| true)
+        let truth_psnr = range.map_or(f64::INFINITY, |range| errors(&still.mean, &still.halves, range).psnr - RESOLVED);
+        measure(windows, &scene, &still, 0.8 * longest, &mut curve.frames).map(|_| Some(truth_psnr))
     };
-    match measured() {
-        Ok(true) => {}
-        Ok(false) => {
+    let truth_psnr = match measured() {
+        Ok(Some(truth_psnr)) => truth_psnr,
+        Ok(None) => {
             charting.skip("pictures by map", "no pixel shows the flow");
             return Ok(None);
         }
         Err(error) => return charting.refused("pictures by map", error).map(|()| None),
-    }
+    };
     if windows.slides.count() >= SLIDES {
         match truth(SLIDES - 1).and_then(|truth| sliding(windows, &scene, Some(&truth), 0.2 * longest)) {
             Ok(found) => curve.sliding = found,
             Err(error) => charting.refused("a sliding window by map", error)?,
         }
     }
-    Ok(Some(curve))
+    Ok(Some((curve, truth_psnr)))
 }
 
 /// Errors of a map's FTLE, as shares of the range of its colours, against two independent maps, over pixels with a value in all three.

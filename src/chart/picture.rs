@@ -127,6 +127,9 @@ pub struct PicturePanel {
     /// The curve of the flow's map, which is another picture, against its own truth; `None` in three dimensions, and if it was not measured.
     #[serde(default)]
     pub map: Option<PictureCurve>,
+    /// As [`PicturePanel::truth_psnr`], of the map's truth; `None` without a map.
+    #[serde(default)]
+    pub map_truth_psnr: Option<f64>,
     /// Kind of the scene's surrogate.
     pub kind: Kind,
     /// The same race as that of `render.method = "auto"`, by the true errors of these curves; `None` if no method reached its target.
@@ -270,8 +273,9 @@ pub(super) fn panel(
 ) -> Result<PicturePanel, RunError> {
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
     let windows = Windows { options, slides, stop: charting.stop };
-    let map = if opened.plan.domain.dimensions == 2 { map::curve(charting, opened, &windows)? } else { None };
-    Ok(PicturePanel { map, auto_is_map, ..volumes(charting, &windows)? })
+    let found = if opened.plan.domain.dimensions == 2 { map::curve(charting, opened, &windows)? } else { None };
+    let (map, map_truth_psnr) = found.unzip();
+    Ok(PicturePanel { map, map_truth_psnr, auto_is_map, ..volumes(charting, &windows)? })
 }
 
 /// Two independent halves of a slide's picture, rendered for so many seconds in all, and the samples a pixel of both.
@@ -319,6 +323,7 @@ fn volumes(charting: &mut Charting<'_>, windows: &Windows<'_>) -> Result<Picture
             truth_psnr: f64::INFINITY,
             curves: Vec::new(),
             map: None,
+            map_truth_psnr: None,
             kind: settings.surrogate.kind,
             race: None,
             auto_is_map: false,
@@ -377,7 +382,17 @@ fn volumes(charting: &mut Charting<'_>, windows: &Windows<'_>) -> Result<Picture
         curves.push(curve);
     }
     let kind = settings.surrogate.kind;
-    let mut panel = PicturePanel { size, truth_samples: samples, truth_psnr, curves, map: None, kind, race: None, auto_is_map: false };
+    let mut panel = PicturePanel {
+        size,
+        truth_samples: samples,
+        truth_psnr,
+        curves,
+        map: None,
+        map_truth_psnr: None,
+        kind,
+        race: None,
+        auto_is_map: false,
+    };
     panel.race = Race::of_times(|method, target| {
         let curve = panel.curve(method)?;
         match method {

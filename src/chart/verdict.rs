@@ -137,7 +137,7 @@ fn cheapest<'a>(within: impl Iterator<Item = &'a FtlePoint>) -> Option<String> {
 }
 
 fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
-    said.extend(panel.map.as_ref().map(of_map));
+    said.extend(panel.map.as_ref().map(|curve| of_map(curve, panel.map_truth_psnr)));
     if panel.curves.is_empty() {
         said.push(if panel.map.is_some() { "Pictures of the volume view: not measured.".into() } else { "Pictures: not measured.".into() });
         return;
@@ -176,9 +176,11 @@ fn rate(curve: &PictureCurve) -> Option<String> {
     Some(format!("{} {:.2}/s{psnr}", curve.name(), found.frames_per_second))
 }
 
-/// When the map reaches each target.
-fn of_map(curve: &PictureCurve) -> String {
+/// When the map reaches each target that its truth tells.
+fn of_map(curve: &PictureCurve, truth_psnr: Option<f64>) -> String {
+    let resolved = truth_psnr.map_or(f64::INFINITY, |psnr| psnr + RESOLVED);
     let reached = TARGETS.iter().map(|&target| match curve.seconds_to(target) {
+        _ if target > resolved => format!("{target} dB not told by its truth, which tells up to {resolved:.1} dB"),
         Some(seconds) => format!("{target} dB after {}", duration(seconds)),
         None => format!("{target} dB not in the time given"),
     });
