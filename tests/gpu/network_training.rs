@@ -160,12 +160,13 @@ fn training_learns_of_derivatives_what_the_cpu_learns() {
         jacobian_weight: 0.01,
         ..NetworkSettings::default()
     };
+    // At a rate of 1e-2 the loss of the wide network leaps: a thousandth of its first parameters changes its last losses by 40 % on the CPU, and by 1 % at 1e-3.
     let cases = [
-        ("plane", usual.clone(), &[0, 1][..]),
-        ("space", usual.clone(), &[0, 1, 2]),
-        ("space, 256 wide", NetworkSettings { width: 256, ..usual }, &[0, 1, 2]),
+        ("plane", usual.clone(), &[0, 1][..], 1e-2),
+        ("space", usual.clone(), &[0, 1, 2], 1e-2),
+        ("space, 256 wide", NetworkSettings { width: 256, ..usual }, &[0, 1, 2], 1e-3),
     ];
-    for (name, settings, axes) in cases {
+    for (name, settings, axes, rate) in cases {
         let extent = [2.0, 1.0, 1.5];
         let shape = Architecture::new(&settings, axes, extent).unwrap();
         let samples = labels(1 << 15, 7);
@@ -175,7 +176,7 @@ fn training_learns_of_derivatives_what_the_cpu_learns() {
         let mut device = training(&model, &objective);
         let pool = device.upload(&samples, None).unwrap();
         let (count, all) = (4096, 150);
-        let steps = drawn_steps(count, all);
+        let steps: Vec<PlannedStep> = drawn_steps(count, all).into_iter().map(|step| PlannedStep { rate, ..step }).collect();
         let found = device.train_steps(&pool, None, &steps).unwrap();
         let (expected, _) = trained_by_cpu(&mut model, &objective, &samples, &steps);
         let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;
