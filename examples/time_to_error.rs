@@ -1,7 +1,7 @@
 //! Measures the time to error after a slide: the seconds from a new window until the picture has 30, 35, 40 and 45 dB over lit pixels and keeps them, for
-//! five slides seen by three cameras. Runs on a GPU if there is one. Prints a table.
+//! five slides seen by three cameras. Runs on a GPU if there is one. Prints a table, and what each slide took to standard error.
 //!
-//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [table.key=value]`: frames a slide; a method of smooth frames, `auto`, `gated` or
+//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [cameras=1..3] [table.key=value]`: frames a slide; a method of smooth frames, `auto`, `gated` or
 //! `reference`, with samples per pixel and frame of its own if given. The seconds of `auto` have its races in them. The truth is the mean of two halves of `reference`; the product of the
 //! differences to the halves is the squared error without their noise, up to a bound that their samples set. The first slide, which compiles
 //! kernels, is not counted. The source needs six slides.
@@ -91,13 +91,19 @@ struct Found {
 fn measure(scene: &Settings, truths: &[Truth], device: &Device) -> Vec<Found> {
     let mut found = vec![Found::default(); truths.len()];
     let mut sum = Film::new(scene.render.width, scene.render.height);
+    let mut shown = u64::MAX;
     frames(scene, device, |frame| {
+        let seconds = &frame.record.seconds;
+        if frame.record.slide != shown {
+            shown = frame.record.slide;
+            eprint!("\n{} ms: race {:.1}, slide {:.1}, frames", frame.record.method, 1e3 * seconds.race, 1e3 * seconds.slide);
+        }
+        eprint!(" {:.1}", 1e3 * seconds.total);
         let Some(number) = (frame.record.slide as usize).checked_sub(1) else { return };
         let slide = &mut found[number];
         if slide.frames == 0 {
             sum = Film::new(scene.render.width, scene.render.height);
         }
-        let seconds = &frame.record.seconds;
         slide.seconds += seconds.race + seconds.slide + seconds.total;
         slide.frames += 1;
         let own = matches!(frame.record.method.as_str(), "reference" | "gated") && sum.accumulate(&frame.film).is_ok();
@@ -119,6 +125,8 @@ fn summary(mut values: Vec<f64>) -> String {
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let (keys, words): (Vec<String>, Vec<String>) = arguments.into_iter().partition(|a| a.contains('='));
+    let (cameras, keys): (Vec<String>, Vec<String>) = keys.into_iter().partition(|key| key.starts_with("cameras="));
+    let cameras = cameras.first().map_or(CAMERAS, |key| key.trim_start_matches("cameras=").parse().unwrap());
     let file = Path::new(&words[0]);
     let (truth_samples, count): (f64, usize) = (words[1].parse().unwrap(), words[2].parse().unwrap());
     let candidates: Vec<Candidate> = words[3..].iter().map(|word| Candidate::parse(word)).collect();
@@ -128,7 +136,7 @@ fn main() {
     (scene.time.warmup_frames, scene.time.slides, scene.time.frames_per_slide) = (0, Some(SLIDES), 1);
     scene.transfer = Some(fixed_colours(&scene, &device).unwrap());
     let mut all: Vec<Vec<Found>> = vec![Vec::new(); candidates.len()];
-    for number in 0..CAMERAS {
+    for number in 0..cameras {
         scene.camera = Some(camera(&scene, number));
         let truths = truths(&scene, truth_samples, &device);
         assert_eq!(truths.len(), SLIDES - 1, "the source has too few slides");
@@ -136,12 +144,13 @@ fn main() {
             let mut scene = scene.clone();
             (scene.render.method, scene.surrogate.kind, scene.time.frames_per_slide) = (candidate.method, candidate.kind, count);
             scene.render.samples = candidate.samples.unwrap_or(scene.render.samples);
+            eprint!("\n{}, camera {number}", candidate.name);
             all.extend(measure(&scene, &truths, &device));
         }
     }
-    let pictures = CAMERAS * (SLIDES - 1);
+    let pictures = cameras * (SLIDES - 1);
     println!(
-        "{}: {} x {} pixels, {pictures} pictures ({} slides, {CAMERAS} cameras), truth of 2 x {truth_samples} samples; seconds to error, median (worst)",
+        "{}: {} x {} pixels, {pictures} pictures ({} slides, {cameras} cameras), truth of 2 x {truth_samples} samples; seconds to error, median (worst)",
         file.file_stem().unwrap_or_default().display(),
         scene.render.width,
         scene.render.height,
