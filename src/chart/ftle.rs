@@ -519,22 +519,23 @@ fn adaptive(bench: &mut Bench<'_, '_>, place: &str) -> Result<(), RunError> {
 fn composed(bench: &mut Bench<'_, '_>, steps: usize, place: &str) -> Result<(), RunError> {
     let own = bench.opened.own_nodes(false);
     let intervals = bench.opened.intervals;
+    let (velocity, map, time) = (&bench.opened.slide.velocity, &bench.opened.plan.map, bench.opened.slide.time);
+    let Some(values) = Composition::values_per_node(velocity, map) else {
+        bench.charting.skip("composition", "not if particles wrap, leave with an FTLE of 0, or have durations of their own");
+        return Ok(());
+    };
     for factor in [0.5, 1.0, 2.0] {
         let nodes = scaled(own, factor);
         let what = format!("composed flow maps of {} nodes", shape(nodes));
-        // Joining keeps half as many tables beside the others.
         let count = nodes.iter().product::<usize>();
-        if !fits(bench, &what, count, Composition::MOST_VALUES * count * (intervals + intervals.div_ceil(2))) {
+        // Joining keeps half as many tables beside the others, and then a quarter.
+        if !fits(bench, &what, count, values * count * intervals * 7 / 4) {
             continue;
         }
         let began = Instant::now();
-        let (velocity, map, time) = (&bench.opened.slide.velocity, &bench.opened.plan.map, bench.opened.slide.time);
         let per_interval = steps.div_ceil(intervals);
         let built = bench.charting.pool.install(|| Composition::trace(velocity, map, time, nodes, intervals, per_interval));
-        let Some(plain) = built.map_err(RunError::Flow)? else {
-            bench.charting.skip("composition", "not if particles wrap, leave with an FTLE of 0, or have durations of their own");
-            return Ok(());
-        };
+        let Some(plain) = built.map_err(RunError::Flow)? else { continue };
         let plain_seconds = began.elapsed().as_secs_f64();
         let joined = bench.charting.pool.install(|| plain.joined());
         let joined_seconds = began.elapsed().as_secs_f64();

@@ -3,9 +3,9 @@
 //! interval only.
 
 use super::axis_map::AxisMap;
-use super::sphere::{Globe, GlobeLocation, dot, normalised, project, trigonometry};
+use super::sphere::{Globe, GlobeLocation, MIN_COSINE, dot, normalised, project, trigonometry};
 use super::stretch::log_stretch;
-use super::{Boundary, Extras, FlowError, FlowMap, Normalisation, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use super::{Boundary, Extras, FlowError, FlowMap, Integrator, Normalisation, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use rayon::prelude::*;
 use ridgewatch_field::{Axis, Domain, DomainPoint, Geometry, UnitPoint};
 
@@ -15,12 +15,29 @@ const AT_ONCE: usize = 1 << 20;
 const CHUNK: usize = 1 << 10;
 /// Most components of a state, and most values of a node.
 const STATE: usize = 4;
-const VALUES: usize = Composition::MOST_VALUES;
+const VALUES: usize = STATE + 1;
 /// Share of an interval from which on a particle did not stop in it, but for rounding.
 const SURVIVES: f64 = 1.0 - 1e-5;
 
 /// Place of a particle: unit coordinates, or on a sphere a unit vector and, with levels, the height in unit coordinates.
 type State = [f64; STATE];
+
+/// What the nodes of a flow hold.
+#[derive(Debug, Clone, Copy)]
+struct Layout {
+    dimensions: usize,
+    /// Radius of the sphere; `None` in a box.
+    radius: Option<f64>,
+    /// True if the last value of a node is the share of the interval after which its particle stops; 1: it does not.
+    stops: bool,
+}
+
+/// Displacements of the nodes, over some intervals.
+#[derive(Debug, Clone)]
+struct Table {
+    values: Vec<f32>,
+    intervals: usize,
+}
 
 /// A chain of tabulated flow maps, one per interval of time, earliest first.
 #[derive(Debug, Clone)]
@@ -28,28 +45,47 @@ pub struct Composition {
     /// Nodes along x, y, z, of a regular grid over the domain, x fastest; one along z in two dimensions.
     nodes: [usize; 3],
     domain: Domain,
-    sphere: Option<Sphere>,
-    /// True if the last value of a node is the share of the interval after which its particle stops; 1: it does not.
-    stops: bool,
-    /// Displacement of the state over an interval, of each node.
-    tables: Vec<Vec<f32>>,
+    layout: Layout,
+    /// Locates directions among the nodes of a sphere.
+    globe: Option<Globe<f64>>,
+    tables: Vec<Table>,
 }
 
-/// A sphere on whose longitudes and latitudes the nodes lie.
-#[derive(Debug, Clone)]
-struct Sphere {
-    /// Locates directions among the nodes.
-    globe: Globe<f64>,
-    radius: f64,
+impl Layout {
+    /// `None` if particles wrap, leave with an FTLE of 0 or have their own durations, which a displacement does not tell.
+    fn new(velocity: &VelocitySource, map: &FlowMap) -> Option<Self> {
+        let (dimensions, radius, wraps, has_missing) = match velocity {
+            VelocitySource::Analytic(_, domain) => (domain.dimensions, None, false, false),
+            VelocitySource::Window(window) => {
+                let grid = window.grid()?;
+                let has_missing = window.snapshots().any(|snapshot| snapshot.missing_nodes() > 0);
+                let is_periodic = grid.axes.iter().any(|axis| axis.period().is_some());
+                match grid.geometry {
+                    Geometry::Cartesian => (grid.dimensions(), None, is_periodic, has_missing),
+                    Geometry::Sphere { radius } => (grid.dimensions(), Some(radius), false, has_missing),
+                }
+            }
+        };
+        let is_told = !matches!(map.boundary, Boundary::Periodic | Boundary::Zero) && map.normalisation == Normalisation::Tau;
+        // Without a velocity particles stop under any policy.
+        (is_told && !wraps).then_some(Self { dimensions, radius, stops: map.boundary == Boundary::Stop || has_missing })
+    }
+
+    /// Components of a state that particles change.
+    fn components(self) -> usize {
+        if self.radius.is_some() { 3 + usize::from(self.dimensions == 3) } else { self.dimensions }
+    }
+
+    /// Values of a node.
+    fn values(self) -> usize {
+        self.components() + usize::from(self.stops)
+    }
 }
 
 impl Composition {
-    /// Most values of a node: a displacement on a sphere with levels, and a share of the interval.
-    pub const MOST_VALUES: usize = STATE + 1;
-
-    /// Traces the displacements over `intervals` equal parts of tau, with the interpolation, boundary and direction of `map`, and `steps` Runge-Kutta
-    /// steps per part. A particle that stops in an interval keeps the stretch that it has at its end. `None` if particles wrap, leave with an FTLE of 0
-    /// or have their own durations, which the displacement does not tell.
+    /// Traces the displacements over `intervals` equal parts of tau by the tangent flow's Runge-Kutta steps, `steps` per part, with the interpolation,
+    /// boundary and direction of `map`. `None` if particles wrap, leave with an FTLE of 0 or have their own durations, which a displacement does not
+    /// tell. A particle stops in the interval in which that of the nearest node does.
     ///
     /// # Errors
     /// As [`cpu_tracer`].
@@ -61,92 +97,89 @@ impl Composition {
         intervals: usize,
         steps: usize,
     ) -> Result<Option<Self>, FlowError> {
-        if matches!(map.boundary, Boundary::Periodic | Boundary::Zero) || map.normalisation == Normalisation::Lifetime {
-            return Ok(None);
-        }
+        let Some(layout) = Layout::new(velocity, map) else { return Ok(None) };
         let part = map.tau / intervals.max(1) as f64;
-        let map = FlowMap { tau: part, steps: Steps::Fixed(steps.max(1)), ..map.clone() };
-        let radius = match velocity {
-            VelocitySource::Window(window) => window.grid().and_then(|grid| match grid.geometry {
-                Geometry::Cartesian => None,
-                Geometry::Sphere { radius } => Some(radius),
-            }),
-            VelocitySource::Analytic(..) => None,
-        };
+        let map = FlowMap { tau: part, steps: Steps::Fixed(steps.max(1)), integrator: Integrator::Tangent, ..map.clone() };
         let mut composition: Option<Self> = None;
         for interval in 0..intervals.max(1) {
             let tracer = cpu_tracer(velocity.clone(), &map, t0 + map.direction.sign() * part * interval as f64)?;
-            let built = composition.get_or_insert_with(|| Self::empty(tracer.domain(), radius, map.boundary == Boundary::Stop, nodes));
+            let built = composition.get_or_insert_with(|| Self::empty(tracer.domain(), layout, nodes));
             let table = built.traced(&*tracer);
             built.tables.push(table);
         }
         Ok(composition)
     }
 
-    fn empty(domain: &Domain, radius: Option<f64>, stops: bool, nodes: [usize; 3]) -> Self {
-        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < domain.dimensions { nodes[axis].max(2) } else { 1 });
+    /// Values that a node of one interval has, of four bytes each; `None` as for [`Composition::trace`].
+    pub fn values_per_node(velocity: &VelocitySource, map: &FlowMap) -> Option<usize> {
+        Layout::new(velocity, map).map(Layout::values)
+    }
+
+    fn empty(domain: &Domain, layout: Layout, nodes: [usize; 3]) -> Self {
+        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < layout.dimensions { nodes[axis].max(2) } else { 1 });
         let axis =
             |k: usize| Axis::uniform("", "", domain.min[k], domain.max[k], nodes[k]).map(|axis| AxisMap::new(&axis, Boundary::Clamp));
         // A domain has an extent along each of its axes.
-        let globe = radius.and_then(|radius| Some(Sphere { globe: Globe::new(&axis(0).ok()?, &axis(1).ok()?), radius }));
-        Self { nodes, domain: domain.clone(), sphere: globe, stops, tables: Vec::new() }
+        let globe = layout.radius.and_then(|_| Some(Globe::new(&axis(0).ok()?, &axis(1).ok()?)));
+        Self { nodes, domain: domain.clone(), layout, globe, tables: Vec::new() }
     }
 
     /// Displacements over the interval of a tracer.
-    fn traced(&self, tracer: &dyn Tracer) -> Vec<f32> {
-        let (components, values) = (self.components(), self.values());
+    fn traced(&self, tracer: &dyn Tracer) -> Table {
+        let (components, values) = (self.layout.components(), self.layout.values());
         let mut table = vec![0.0; values * self.nodes.iter().product::<usize>()];
         let mut traced = Traced::default();
         for (number, rows) in table.chunks_mut(values * AT_ONCE).enumerate() {
             let first = number * AT_ONCE;
-            let unit: Vec<UnitPoint> = (first..first + rows.len() / values).into_par_iter().map(|node| self.unit(node)).collect();
-            let seeds: Vec<DomainPoint> = unit.par_iter().map(|&point| self.domain.from_unit(point)).collect();
+            let nodes = first..first + rows.len() / values;
+            let seeds: Vec<DomainPoint> = nodes.into_par_iter().map(|node| self.seed(node)).collect();
             tracer.trace(&seeds, Extras { arrival: true, jacobian: false }, &mut traced);
-            let arrived = traced.arrival.iter().zip(&traced.lifetime_share);
-            for ((row, seed), (arrival, share)) in rows.chunks_exact_mut(values).zip(&unit).zip(arrived) {
-                let (from, to) = (self.state(*seed), self.state(self.domain.to_unit_unclamped(*arrival)));
-                // Missing cells have no arrival; a particle rests there.
-                let is_known = to.iter().all(|x| x.is_finite());
-                for i in 0..components {
-                    row[i] = if is_known { (to[i] - from[i]) as f32 } else { 0.0 };
+            rows.par_chunks_exact_mut(values).enumerate().for_each(|(i, row)| {
+                let [from, to] = [seeds[i], traced.arrival[i]].map(|point| self.state(point.0.map(f64::from)));
+                for component in 0..components {
+                    row[component] = (to[component] - from[component]) as f32;
                 }
-                if self.stops {
-                    row[components] = if is_known && share.is_finite() { *share } else { 0.0 };
+                if self.layout.stops {
+                    row[components] = traced.lifetime_share[i];
                 }
-            }
+            });
         }
-        table
+        Table { values: table, intervals: 1 }
     }
 
     /// Joins neighbouring intervals until one is left (the hierarchical variant): a sample then takes one look-up instead of one per interval.
     /// Each joining interpolates once more.
     #[must_use]
     pub fn joined(&self) -> Self {
-        let join = |tables: &[Vec<f32>]| tables.chunks(2).map(|pair| self.join(pair)).collect::<Vec<_>>();
+        let join = |tables: &[Table]| tables.chunks(2).map(|pair| self.join(pair)).collect::<Vec<_>>();
         let mut tables = join(&self.tables);
         while tables.len() > 1 {
             tables = join(&tables);
         }
-        Self { tables, ..self.clone() }
+        Self { nodes: self.nodes, domain: self.domain.clone(), layout: self.layout, globe: self.globe.clone(), tables }
     }
 
-    fn join(&self, pair: &[Vec<f32>]) -> Vec<f32> {
+    fn join(&self, pair: &[Table]) -> Table {
         let mut joint = pair[0].clone();
         let Some(second) = pair.get(1) else { return joint };
-        let components = self.components();
-        joint.par_chunks_exact_mut(self.values()).enumerate().for_each(|(node, row)| {
-            let from = self.state(self.unit(node));
-            let mut at: State = std::array::from_fn(|i| if i < components { from[i] + f64::from(row[i]) } else { 0.0 });
-            if self.stops && row[components] < SURVIVES as f32 {
+        let (components, intervals) = (self.layout.components(), joint.intervals + second.intervals);
+        let [first_part, second_part] = [joint.intervals, second.intervals].map(|part| part as f64 / intervals as f64);
+        joint.intervals = intervals;
+        joint.values.par_chunks_exact_mut(self.layout.values()).enumerate().for_each(|(node, row)| {
+            let is_over = self.layout.stops && f64::from(row[components]) < SURVIVES;
+            if is_over {
+                row[components] = (first_part * f64::from(row[components])) as f32;
                 return;
             }
+            let from = self.state(self.coordinates(node));
+            let mut at: State = std::array::from_fn(|i| if i < components { from[i] + f64::from(row[i]) } else { from[i] });
             let (value, _) = self.interpolate(second, self.place(&at).nodes);
             self.advance::<0>(&mut at, &mut [[]; STATE], &value);
             for i in 0..components {
                 row[i] = (at[i] - from[i]) as f32;
             }
-            if self.stops {
-                row[components] = value[components] as f32;
+            if self.layout.stops {
+                row[components] = (first_part + second_part * value[components]) as f32;
             }
         });
         joint
@@ -154,48 +187,45 @@ impl Composition {
 
     /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
-        self.tables.iter().map(|table| size_of_val(&table[..])).sum()
+        self.tables.iter().map(|table| size_of_val(&table.values[..])).sum()
     }
 
-    /// Components of a state that particles change.
-    fn components(&self) -> usize {
-        if self.sphere.is_some() { 3 + usize::from(self.domain.dimensions == 3) } else { self.domain.dimensions.clamp(2, 3) }
-    }
-
-    /// Values of a node.
-    fn values(&self) -> usize {
-        self.components() + usize::from(self.stops)
-    }
-
-    /// Unit coordinates of a node. Two-dimensional flows are traced in the middle of the slab.
-    fn unit(&self, node: usize) -> UnitPoint {
-        let [x, y, _] = self.nodes;
+    /// Domain coordinates of a node. Two-dimensional flows are traced in the middle of the slab.
+    fn coordinates(&self, node: usize) -> [f64; 3] {
+        let ([x, y, _], extent) = (self.nodes, self.domain.extent());
         let index = [node % x, node / x % y, node / (x * y)];
-        UnitPoint(std::array::from_fn(|axis| if self.nodes[axis] > 1 { index[axis] as f32 / (self.nodes[axis] - 1) as f32 } else { 0.5 }))
+        let unit = |axis: usize| if self.nodes[axis] > 1 { index[axis] as f64 / (self.nodes[axis] - 1) as f64 } else { 0.5 };
+        std::array::from_fn(|axis| self.domain.min[axis] + extent[axis] * unit(axis))
     }
 
-    /// Sine and cosine of longitude and latitude of a unit point on the sphere.
-    fn trigonometry(&self, point: UnitPoint) -> [f64; 4] {
+    /// The seed of a node, in single precision and not outside of the domain.
+    fn seed(&self, node: usize) -> DomainPoint {
+        let at = self.coordinates(node);
+        DomainPoint(std::array::from_fn(|axis| match at[axis] as f32 {
+            x if f64::from(x) < self.domain.min[axis] => x.next_up(),
+            x if f64::from(x) > self.domain.max[axis] => x.next_down(),
+            x => x,
+        }))
+    }
+
+    /// State at domain coordinates.
+    fn state(&self, point: [f64; 3]) -> State {
         let extent = self.domain.extent();
-        trigonometry(std::array::from_fn(|k| self.domain.min[k] + extent[k] * f64::from(point.0[k])))
-    }
-
-    fn state(&self, point: UnitPoint) -> State {
-        let [x, y, z] = point.0.map(f64::from);
-        if self.sphere.is_none() {
+        let [x, y, z] = std::array::from_fn(|axis| (point[axis] - self.domain.min[axis]) / extent[axis]);
+        if self.globe.is_none() {
             return [x, y, z, 0.0];
         }
-        let [sin_lon, cos_lon, sin_lat, cos_lat] = self.trigonometry(point);
+        let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
         [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat, z]
     }
 
     /// d state / d seed along an orthonormal basis at the seed, lengths in units of the domain, or in radii.
-    fn initial_tangent<const C: usize>(&self, point: UnitPoint) -> [[f64; C]; STATE] {
+    fn initial_tangent<const C: usize>(&self, point: [f64; 3]) -> [[f64; C]; STATE] {
         let extent = self.domain.extent();
-        let full = match &self.sphere {
+        let full = match self.layout.radius {
             None => [[1.0 / extent[0], 0.0, 0.0], [0.0, 1.0 / extent[1], 0.0], [0.0, 0.0, 1.0 / extent[2]], [0.0; 3]],
-            Some(Sphere { radius, .. }) => {
-                let [sin_lon, cos_lon, sin_lat, cos_lat] = self.trigonometry(point);
+            Some(radius) => {
+                let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
                 [
                     [-sin_lon, -sin_lat * cos_lon, 0.0],
                     [cos_lon, -sin_lat * sin_lon, 0.0],
@@ -210,11 +240,10 @@ impl Composition {
     /// Gradient of the flow map between orthonormal bases at seed and arrival.
     fn gradient<const C: usize>(&self, at: &State, tangent: &[[f64; C]; STATE]) -> [[f64; C]; C] {
         let extent = self.domain.extent();
-        let Some(Sphere { globe, radius }) = &self.sphere else {
+        let (Some(globe), Some(radius)) = (&self.globe, self.layout.radius) else {
             return std::array::from_fn(|i| tangent[i].map(|x| x * extent[i]));
         };
-        let p = [at[0], at[1], at[2]];
-        let basis = globe.basis(&p, globe.locate(&p).cosine);
+        let basis = globe.basis(&[at[0], at[1], at[2]], at[0].hypot(at[1]).max(MIN_COSINE));
         std::array::from_fn(|i| {
             std::array::from_fn(|c| match i {
                 0 | 1 => dot(&basis[i], &[tangent[0][c], tangent[1][c], tangent[2][c]]),
@@ -226,20 +255,17 @@ impl Composition {
     fn place(&self, at: &State) -> Place {
         // Outside the domain displacement and derivatives are those at its edge.
         let within = |x: f64, axis: usize| x.clamp(0.0, 1.0) * (self.nodes[axis] - 1) as f64;
-        match &self.sphere {
-            None => Place { nodes: std::array::from_fn(|axis| within(at[axis], axis)), on_sphere: None },
-            Some(Sphere { globe, .. }) => {
-                let here = globe.locate(&[at[0], at[1], at[2]]);
-                let [longitude, latitude] = [0, 1].map(|axis| here.location[axis].clamp(0.0, (self.nodes[axis] - 1) as f64));
-                Place { nodes: [longitude, latitude, within(at[3], 2)], on_sphere: Some(here) }
-            }
-        }
+        let Some(globe) = &self.globe else {
+            return Place { nodes: std::array::from_fn(|axis| within(at[axis], axis)), on_sphere: None };
+        };
+        let here = globe.locate(&[at[0], at[1], at[2]]);
+        let [longitude, latitude] = [0, 1].map(|axis| here.location[axis].clamp(0.0, (self.nodes[axis] - 1) as f64));
+        Place { nodes: [longitude, latitude, within(at[3], 2)], on_sphere: Some(here) }
     }
 
     /// Interpolated values among the nodes and their derivatives along the axes, per node.
-    fn interpolate(&self, table: &[f32], place: [f64; 3]) -> ([f64; VALUES], [[f64; 3]; VALUES]) {
-        let ([nx, ny, _], values) = (self.nodes, self.values());
-        let axes = self.domain.dimensions.clamp(2, 3);
+    fn interpolate(&self, table: &Table, place: [f64; 3]) -> ([f64; VALUES], [[f64; 3]; VALUES]) {
+        let ([nx, ny, _], values, axes) = (self.nodes, self.layout.values(), self.layout.dimensions);
         let (mut low, mut fraction) = ([0; 3], [0.0; 3]);
         for axis in 0..axes {
             low[axis] = (place[axis] as usize).min(self.nodes[axis] - 2);
@@ -250,7 +276,7 @@ impl Composition {
             let high = |axis: usize| corner >> axis & 1;
             let weight = |axis: usize| if high(axis) == 1 { fraction[axis] } else { 1.0 - fraction[axis] };
             let node = (low[0] + high(0)) + nx * ((low[1] + high(1)) + ny * (if axes == 3 { low[2] + high(2) } else { 0 }));
-            let row = &table[values * node..values * (node + 1)];
+            let row = &table.values[values * node..values * (node + 1)];
             let all: f64 = (0..axes).map(weight).product();
             let mut slopes = [0.0; 3];
             for axis in 0..axes {
@@ -267,11 +293,18 @@ impl Composition {
         (value, derivative)
     }
 
+    /// Whether the particle of the nearest node stops in the intervals of a table.
+    fn stops_at(&self, table: &Table, place: [f64; 3]) -> bool {
+        let ([nx, ny, _], values) = (self.nodes, self.layout.values());
+        let [x, y, z]: [usize; 3] = std::array::from_fn(|axis| (place[axis].round() as usize).min(self.nodes[axis] - 1));
+        self.layout.stops && f64::from(table.values[values * (x + nx * (y + ny * z)) + values - 1]) < SURVIVES
+    }
+
     /// Changes of the place among the nodes for a change of the state.
     fn differentials(&self, place: &Place, change: State) -> [f64; 3] {
         let cells = self.nodes.map(|n| (n.max(2) - 1) as f64);
-        match (&self.sphere, &place.on_sphere) {
-            (Some(Sphere { globe, .. }), Some(here)) => {
+        match (&self.globe, &place.on_sphere) {
+            (Some(globe), Some(here)) => {
                 let basis = globe.basis(&here.p, here.cosine);
                 let (_, [longitude, latitude]) = globe.differentials(here, &basis, [change[0], change[1], change[2]]);
                 [longitude, latitude, change[3] * cells[2]]
@@ -280,10 +313,10 @@ impl Composition {
         }
     }
 
-    /// Adds a displacement to a state, and what was added to its tangent too; both stay on the sphere.
+    /// Adds a displacement to a state, whose tangent has what was added already; both stay on the sphere.
     fn advance<const C: usize>(&self, at: &mut State, tangent: &mut [[f64; C]; STATE], value: &[f64; VALUES]) {
-        (0..self.components()).for_each(|i| at[i] += value[i]);
-        if self.sphere.is_none() {
+        (0..self.layout.components()).for_each(|i| at[i] += value[i]);
+        if self.globe.is_none() {
             return;
         }
         let (p, inverse) = normalised(&[at[0], at[1], at[2]]);
@@ -298,16 +331,28 @@ impl Composition {
     pub fn log_stretch(&self, points: &[UnitPoint], out: &mut [f64]) {
         points.par_chunks(CHUNK).zip(out.par_chunks_mut(CHUNK)).for_each(|(points, out)| {
             for (point, out) in points.iter().zip(out) {
-                *out = if self.domain.dimensions == 2 { self.stretch_at::<2>(*point) } else { self.stretch_at::<3>(*point) };
+                *out = if self.layout.dimensions == 2 { self.stretch_at::<2>(*point) } else { self.stretch_at::<3>(*point) };
             }
         });
     }
 
     fn stretch_at<const C: usize>(&self, point: UnitPoint) -> f64 {
-        let (mut at, mut tangent, components) = (self.state(point), self.initial_tangent::<C>(point), self.components());
+        let (extent, components) = (self.domain.extent(), self.layout.components());
+        let seed = std::array::from_fn(|axis| self.domain.min[axis] + extent[axis] * f64::from(point.0[axis]));
+        let (mut at, mut tangent) = (self.state(seed), self.initial_tangent::<C>(seed));
         for table in &self.tables {
             let place = self.place(&at);
-            let (value, derivative) = self.interpolate(table, place.nodes);
+            let (value, mut derivative) = self.interpolate(table, place.nodes);
+            let share = value[components];
+            if self.layout.stops && share < SURVIVES {
+                // A particle keeps the gradient that it has when it stops; the displacement also changes since neighbours stop sooner or later.
+                for i in 0..components {
+                    for axis in 0..3 {
+                        let by_time = if share > 0.0 { value[i] / share * derivative[components][axis] } else { derivative[i][axis] };
+                        derivative[i][axis] -= by_time;
+                    }
+                }
+            }
             for c in 0..C {
                 let change = self.differentials(&place, std::array::from_fn(|i| tangent[i][c]));
                 for i in 0..components {
@@ -315,7 +360,7 @@ impl Composition {
                 }
             }
             self.advance(&mut at, &mut tangent, &value);
-            if self.stops && value[components] < SURVIVES {
+            if self.stops_at(table, place.nodes) {
                 break;
             }
         }
