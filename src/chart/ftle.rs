@@ -1,8 +1,9 @@
-//! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
+//! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, and networks.
 
+use super::networks::networks;
 use super::slides::FirstSlides;
 use super::{Charting, device_name, failed, front, pick, with_method};
-use crate::backend::{Backend, Cpu, Device, Surrogate, SurrogateRequest, audit};
+use crate::backend::{Backend, Cpu, Device, Surrogate, SurrogateRequest};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
 use crate::field::{DomainPoint, UnitPoint};
@@ -12,8 +13,8 @@ use crate::flow::{
 use crate::render::Method;
 use crate::render::rng::{philox, unit};
 use crate::run::{Plan, RunError, Settings, Setup, Slide, auto_steps};
-use crate::surrogate::network::{Architecture, Encoding, NetworkSettings};
-use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
+use crate::surrogate::network::NetworkSettings;
+use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, SurrogateSettings, Trace};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
@@ -35,19 +36,8 @@ const NETWORKS_SHARE: f64 = 0.75;
 /// Seconds over which the speed of a method is measured.
 const TIMED: f64 = 0.25;
 /// Fewest points of a timed batch, and most on the CPU and on a GPU.
-const MIN_BATCH: usize = 1 << 12;
+pub(super) const MIN_BATCH: usize = 1 << 12;
 const MAX_BATCH: [usize; 2] = [1 << 20, 1 << 23];
-/// Seconds for which networks are trained before each measurement, the tracing of their labels included.
-const TRAINED: [f64; 3] = [1.0, 3.0, 10.0];
-/// Seconds of training between fresh labels, at first and at most, and how often a label is trained on.
-const SLICES: [f64; 2] = [0.02, 0.25];
-const REUSE: u64 = 4;
-/// Labels before the first training, and most fresh ones afterwards.
-const FIRST_LABELS: usize = 1 << 16;
-const MAX_FRESH: usize = 1 << 24;
-/// A small network has a table of 2^-5 or less, and one sixteenth of the entries of all levels at most.
-const SMALLER: u32 = 5;
-const FEWER: usize = 16;
 /// What is said of methods that ran on the CPU in a chart of a GPU.
 #[cfg(feature = "cuda")]
 const ON_THE_CPU: &str = ", on the CPU";
@@ -220,7 +210,7 @@ impl Points {
         Self::numbered(opened, 0..count as u32, stream)
     }
 
-    fn numbered(opened: &Opened, numbers: Range<u32>, stream: u32) -> Self {
+    pub(super) fn numbered(opened: &Opened, numbers: Range<u32>, stream: u32) -> Self {
         let (seed, domain) = (opened.plan.scene.seed, &opened.plan.domain);
         let unit: Vec<UnitPoint> = numbers
             .map(|i| {
@@ -239,9 +229,9 @@ impl Points {
 }
 
 /// Points with their true FTLE, and what is measured on them.
-struct Bench<'a, 'b> {
-    charting: &'a mut Charting<'b>,
-    opened: &'a Opened,
+pub(super) struct Bench<'a, 'b> {
+    pub(super) charting: &'a mut Charting<'b>,
+    pub(super) opened: &'a Opened,
     points: Points,
     truth: Vec<f64>,
     timed: Points,
@@ -262,11 +252,21 @@ impl Bench<'_, '_> {
     /// As [`Charting::with_share`].
     #[cfg(feature = "cuda")]
     fn with_share<T>(&mut self, share: f64, work: impl FnOnce(&mut Self) -> T) -> T {
-        let whole = self.charting.ends;
-        self.charting.ends = Instant::now() + whole.saturating_duration_since(Instant::now()).mul_f64(share);
+        let (whole, end) = (self.charting.ends, self.charting.end_of_share(share));
+        self.charting.ends = end;
         let result = work(self);
         self.charting.ends = whole;
         result
+    }
+
+    /// Nodes are traced by this tracer of the CPU from now on.
+    #[cfg(feature = "cuda")]
+    fn time_nodes_by(&mut self, tracer: &dyn Tracer) {
+        let (_, seeds) = self.timed.first(MIN_BATCH);
+        let mut traced = Traced::default();
+        let began = Instant::now();
+        self.charting.pool.install(|| tracer.trace(seeds, Extras::default(), &mut traced));
+        self.nodes_per_second = Some(seeds.len() as f64 / began.elapsed().as_secs_f64());
     }
 
     /// Measures error and speed of a method. `answer` gives the log-stretch at points, `seconds` the time that points take.
@@ -324,7 +324,13 @@ impl Bench<'_, '_> {
         self.measure(method, setting, built, answer, |_, seeds| tracer.seconds(seeds, &mut traced).map_err(failed))
     }
 
-    fn measure_predictor(&mut self, method: &str, setting: String, seconds: f64, surrogate: &dyn Predict) -> Result<(), RunError> {
+    pub(super) fn measure_predictor(
+        &mut self,
+        method: &str,
+        setting: String,
+        seconds: f64,
+        surrogate: &dyn Predict,
+    ) -> Result<(), RunError> {
         let built = Built { seconds, bytes: surrogate.bytes() as u64 };
         let answer = |points: &Points| {
             let mut values = vec![0.0; points.unit.len()];
@@ -441,7 +447,12 @@ fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64
 }
 
 /// A tracer of the backend. Combinations that it does not have are noted, and give `None`.
-fn tracer_of<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, what: &str, map: &FlowMap) -> Result<Option<B::Tracer>, RunError> {
+pub(super) fn tracer_of<B: Backend>(
+    bench: &mut Bench<'_, '_>,
+    backend: &mut B,
+    what: &str,
+    map: &FlowMap,
+) -> Result<Option<B::Tracer>, RunError> {
     if !bench.charting.has_time_for(what) {
         return Ok(None);
     }
@@ -584,141 +595,8 @@ fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), 
     Ok(())
 }
 
-/// Networks over encodings, sizes and seconds of training, and base + residual.
-fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), RunError> {
-    let map = bench.opened.plan.map.clone();
-    let Some(tracer) = tracer_of(bench, backend, "labels for networks", &map)? else { return Ok(()) };
-    let is_gpu = bench.charting.device.is_gpu();
-    let own = bench.opened.own_nodes(is_gpu);
-    let scene = NetworkSettings { inputs: Vec::new(), start_range: None, ..bench.opened.plan.scene.network.clone() };
-    let suited = bench.opened.shape().filter(|_| is_gpu).map_or(scene.clone(), |shape| scene.suited_to(shape));
-    let domain = &bench.opened.plan.domain;
-    let axes: Vec<usize> = (0..domain.dimensions).collect();
-    let entries =
-        |network: &NetworkSettings| Architecture::new(network, &axes, domain.lengths()).map_or(0, |network| network.table_entries());
-    // Levels that are stored densely do not shrink with the table at once.
-    let sizes = (4..=suited.log2_table().saturating_sub(SMALLER).max(4)).rev();
-    let mut smaller = sizes.map(|log2_table| NetworkSettings { log2_table: Some(log2_table), ..suited.clone() });
-    let small = smaller.find(|network| entries(network) * FEWER <= entries(&suited)).filter(|_| entries(&suited) > 0);
-    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene };
-    let narrow = NetworkSettings { hidden_layers: 4, width: 64, ..frequency.clone() };
-    let mut variants = vec![
-        ("base + residual", Kind::Residual, scaled(own, 0.5), suited.clone()),
-        ("network", Kind::Network, own, suited),
-        ("network", Kind::Network, own, if is_gpu { frequency } else { narrow }),
-    ];
-    // The large ones of both kinds come first, in case that time ends.
-    if let Some(small) = small {
-        variants.insert(2, ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()));
-        variants.insert(3, ("network", Kind::Network, own, small));
-    }
-    variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
-    for (name, kind, nodes, network) in variants {
-        let size = match network.encoding {
-            Encoding::HashGrid => format!("{}x{}, {} entries", network.levels(), network.features, thousands(entries(&network))),
-            Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
-        };
-        let what = format!("{name}, {size}");
-        let count = if kind == Kind::Residual { nodes.iter().product() } else { 0 };
-        if !fits(bench, &what, count, count) {
-            continue;
-        }
-        let began = Instant::now();
-        let settings = SurrogateSettings { kind, table_nodes: Some(nodes), ..SurrogateSettings::default() };
-        let Some(mut surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
-        let built = began.elapsed().as_secs_f64();
-        let mut lessons = Lessons::new(bench.opened);
-        for seconds in TRAINED {
-            if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
-                break;
-            }
-            let (before, is_late) = (lessons.steps, lessons.seconds >= seconds);
-            while lessons.seconds < seconds {
-                bench.charting.pool.install(|| lessons.give(&mut surrogate, &tracer, seconds))?;
-            }
-            if lessons.steps == before {
-                bench.charting.skip(
-                    format_args!("{what}, {seconds} s of training"),
-                    if is_late { "the training before it took longer" } else { "no optimizer step ended in time" },
-                );
-                continue;
-            }
-            let frozen = surrogate.freeze().map_err(failed)?;
-            bench.measure_predictor(name, format!("{size}, {seconds} s"), built + lessons.seconds, &frozen)?;
-        }
-    }
-    Ok(())
-}
-
-/// A count in thousands or millions.
-fn thousands(count: usize) -> String {
-    match count {
-        0..10_000 => count.to_string(),
-        10_000..999_500 => format!("{:.0}k", count as f64 / 1e3),
-        _ => format!("{:.1}M", count as f64 / 1e6),
-    }
-}
-
-/// Training on labels at uniform random points that are traced on the way, as the frames of a run trace theirs.
-struct Lessons<'a> {
-    opened: &'a Opened,
-    /// Labels on the host.
-    buffer: ReplayBuffer,
-    /// Points traced so far, and in the next turn.
-    drawn: u64,
-    fresh: usize,
-    /// Seconds of the next training.
-    slice: f64,
-    /// Optimizer steps so far.
-    steps: u64,
-    /// Seconds of tracing and training so far.
-    seconds: f64,
-}
-
-impl<'a> Lessons<'a> {
-    fn new(opened: &'a Opened) -> Self {
-        let buffer = ReplayBuffer::new(opened.plan.scene.training.replay_buffer);
-        Self { opened, buffer, drawn: 0, fresh: FIRST_LABELS, slice: SLICES[0], steps: 0, seconds: 0.0 }
-    }
-
-    /// Traces fresh labels and trains on all for a slice of time, which doubles up to the longest. Ends at about `end` seconds in all.
-    fn give<S: Surrogate<Tracer = T>, T: Trace>(&mut self, surrogate: &mut S, tracer: &T, end: f64) -> Result<(), RunError> {
-        const STREAM: u32 = 4;
-        let began = Instant::now();
-        let scene = &self.opened.plan.scene;
-        if !surrogate.trace_labels(tracer, scene.seed, self.drawn, self.fresh).map_err(failed)? {
-            let numbers = self.drawn as u32..self.drawn as u32 + self.fresh as u32;
-            let points = Points::numbered(self.opened, numbers, STREAM);
-            self.buffer.push(&audit::trace(tracer, &points.unit, scene.network.label_extras()).map_err(failed)?.samples);
-        }
-        self.drawn += self.fresh as u64;
-        let traced = began.elapsed().as_secs_f64();
-        let left = (end - self.seconds - traced).clamp(0.01, self.slice);
-        let learned = surrogate.learn(&self.buffer, left, u64::MAX).map_err(failed)?;
-        // Tracing takes no longer than training.
-        let as_long = self.fresh as f64 * learned.seconds / traced;
-        self.fresh = ((learned.samples / REUSE) as usize).min(as_long as usize).clamp(MIN_BATCH, MAX_FRESH);
-        self.slice = SLICES[1].min(2.0 * self.slice);
-        self.steps += learned.steps;
-        self.seconds += began.elapsed().as_secs_f64();
-        Ok(())
-    }
-}
-
-impl Bench<'_, '_> {
-    /// Nodes are traced by this tracer of the CPU from now on.
-    #[cfg(feature = "cuda")]
-    fn time_nodes_by(&mut self, tracer: &dyn Tracer) {
-        let (_, seeds) = self.timed.first(MIN_BATCH);
-        let mut traced = Traced::default();
-        let began = Instant::now();
-        self.charting.pool.install(|| tracer.trace(seeds, Extras::default(), &mut traced));
-        self.nodes_per_second = Some(seeds.len() as f64 / began.elapsed().as_secs_f64());
-    }
-}
-
 /// Builds a surrogate on the backend; settings that it refuses are noted.
-fn surrogate_of<B: Backend>(
+pub(super) fn surrogate_of<B: Backend>(
     bench: &mut Bench<'_, '_>,
     backend: &mut B,
     what: &str,
@@ -741,7 +619,7 @@ fn surrogate_of<B: Backend>(
     }
 }
 
-fn scaled(nodes: [usize; 3], factor: f64) -> [usize; 3] {
+pub(super) fn scaled(nodes: [usize; 3], factor: f64) -> [usize; 3] {
     nodes.map(|n| if n > 1 { ((n as f64 * factor) as usize).max(2) } else { 1 })
 }
 
@@ -751,7 +629,7 @@ fn shape(nodes: [usize; 3]) -> String {
 }
 
 /// True if so many nodes can be traced in a quarter of the time that is left, and so many values fit into memory.
-fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize, values: usize) -> bool {
+pub(super) fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize, values: usize) -> bool {
     /// 2 GiB of f32.
     const MAX_VALUES: usize = 1 << 29;
     if !bench.charting.has_time_for(what) {

@@ -9,6 +9,7 @@ mod draw;
 mod front;
 mod ftle;
 mod map;
+mod networks;
 mod picture;
 mod scaling;
 mod slides;
@@ -128,12 +129,15 @@ impl Charting<'_> {
 
     /// Runs work with another end: after the given share of the time that is left.
     fn with_share<T>(&mut self, share: f64, work: impl FnOnce(&mut Self) -> T) -> T {
-        let whole = self.ends;
-        let left = whole.saturating_duration_since(Instant::now());
-        self.ends = Instant::now() + left.mul_f64(share);
+        let (whole, end) = (self.ends, self.end_of_share(share));
+        self.ends = end;
         let result = work(self);
         self.ends = whole;
         result
+    }
+
+    fn end_of_share(&self, share: f64) -> Instant {
+        Instant::now() + Duration::from_secs_f64(share * self.left())
     }
 
     fn left(&self) -> f64 {
