@@ -145,11 +145,14 @@ mod tests {
     use ridgewatch_field::Domain;
 
     fn renderer() -> Renderer {
+        lit_by(LightSettings::directional([0.0, 0.0, -1.0], 1.0))
+    }
+
+    fn lit_by(light: LightSettings) -> Renderer {
         let domain = Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0));
         let settings =
             RenderSettings { width: 64, height: 32, background: [0.2; 3], tone_map: [1.0, 0.5, 1.0], ..RenderSettings::default() };
         let transfer = TransferSettings { low: Some(0.0), high: Some(1.0), extinction: Some(2.0), ..TransferSettings::default() };
-        let light = LightSettings::directional([0.0, 0.0, -1.0], 1.0);
         let camera =
             CameraSettings { eye: [1.0, 0.5, 3.0], look_at: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true };
         let scene = Scene::assemble(&domain, Some(camera), Some(light), Some(transfer), settings, 1);
@@ -190,5 +193,36 @@ mod tests {
             .map(|shown| renderer.pictures_apart(&rays, &shown, &truth).unwrap().squared[0]);
         // Of eight points a net the mean has an eighth of the square, which a single net would count.
         assert!(both_ways < 0.03 * one_way, "{both_ways} {one_way}");
+    }
+
+    #[test]
+    fn a_distant_point_light_is_a_directional_one() {
+        let far = 1e4;
+        let light = LightSettings { direction: None, position: Some([1.0, 0.5, far]), radiance: [far * far; 3] };
+        let [point, directional] = [lit_by(light), renderer()].map(|renderer| {
+            let rays = renderer.ray_points(256, 12);
+            let field = |ftle: f32| vec![ftle; rays.points.len()];
+            renderer.pictures_apart(&rays, &field(0.4), &field(0.5)).unwrap().squared
+        });
+        for (a, b) in point.into_iter().zip(directional) {
+            assert!((a / b - 1.0).abs() < 1e-2, "{point:?} {directional:?}");
+        }
+    }
+
+    /// Where land hides half of the picture, the other half errs as before.
+    #[test]
+    fn missing_cells_are_not_compared() {
+        let renderer = renderer();
+        let rays = renderer.ray_points(1024, 12);
+        let field = |ftle: f32, is_land: &dyn Fn(f32) -> bool| -> Vec<f32> {
+            rays.points.iter().map(|point| if is_land(point.0[0]) { f32::NAN } else { ftle }).collect()
+        };
+        let squared =
+            |is_land: &dyn Fn(f32) -> bool| renderer.pictures_apart(&rays, &field(0.4, is_land), &field(0.5, is_land)).unwrap().squared[0];
+        let (whole, half) = (squared(&|_| false), squared(&|x| x < 1.0));
+        assert!((half / whole - 1.0).abs() < 0.02, "{half} {whole}");
+        // Land that only one of the fields has is a difference: its colour in place of the flow's.
+        let torn = renderer.pictures_apart(&rays, &field(0.5, &|x| x < 1.0), &field(0.5, &|_| false)).unwrap().squared[0];
+        assert!(torn > 10.0 * whole, "{torn} {whole}");
     }
 }
