@@ -73,9 +73,11 @@ def main():
         now, record = time.monotonic(), header["record"]
         gap = 0.0 if last is None else now - last
         last, seen = now, seen + 1
+        error = record["picture_error"]
+        stated = "" if error is None else f", {error['psnr']['value']:.1f} dB stated"
         print(
             f"frame {header['frame']}: time {record['time']:g}, {header['shape'][1]}x{header['shape'][0]} {header['encoding']}, "
-            f"{len(payload)} bytes, traced {100 * record['traced_share']:.1f} %, gap {gap:.3f} s",
+            f"{len(payload)} bytes, traced {100 * record['traced_share']:.1f} %{stated}, gap {gap:.3f} s",
             flush=True,
         )
         for warning in record["warnings"]:

@@ -85,11 +85,13 @@ fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyho
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
         format!(", {:.4} s behind the simulation", now - published)
     });
+    let stated = record["picture_error"]["psnr"]["value"].as_f64().map(|decibels| format!(", {decibels:.1} dB stated"));
     Ok(format!(
-        "frame {number}: time {}, {}x{} {encoding}, {length} bytes, traced {traced:.1} %, gap {gap:.3} s{}",
+        "frame {number}: time {}, {}x{} {encoding}, {length} bytes, traced {traced:.1} %{}, gap {gap:.3} s{}",
         record["time"],
         shape[1],
         shape[0],
+        stated.unwrap_or_default(),
         behind.unwrap_or_default()
     ))
 }
