@@ -13,11 +13,10 @@ use ridgewatch_field::{Axis, Domain, DomainPoint, Geometry, UnitPoint};
 const AT_ONCE: usize = 1 << 20;
 /// Points per parallel task.
 const CHUNK: usize = 1 << 10;
-/// Most components of a state, and most values of a node.
+/// Most components of a state.
 const STATE: usize = 4;
-const VALUES: usize = STATE + 1;
 /// Share of an interval from which on a particle did not stop in it, but for rounding.
-const SURVIVES: f64 = 1.0 - 1e-5;
+const SURVIVES: f32 = 1.0 - 1e-5;
 
 /// Place of a particle: unit coordinates, or on a sphere a unit vector and, with levels, the height in unit coordinates.
 type State = [f64; STATE];
@@ -28,16 +27,13 @@ struct Layout {
     dimensions: usize,
     /// Radius of the sphere; `None` in a box.
     radius: Option<f64>,
-    /// True if the last value of a node is the share of the interval after which its particle stops; 1: it does not.
+    /// True if the last value of a node tells whether its particle stops in the interval: 1 or 0.
     stops: bool,
 }
 
-/// Displacements of the nodes, over some intervals.
+/// Displacements of the nodes over an interval, or over joined ones.
 #[derive(Debug, Clone)]
-struct Table {
-    values: Vec<f32>,
-    intervals: usize,
-}
+struct Table(Vec<f32>);
 
 /// A chain of tabulated flow maps, one per interval of time, earliest first.
 #[derive(Debug, Clone)]
@@ -52,7 +48,7 @@ pub struct Composition {
 }
 
 impl Layout {
-    /// `None` if particles wrap, leave with an FTLE of 0 or have their own durations, which a displacement does not tell.
+    /// `None` as for [`Composition::trace`].
     fn new(velocity: &VelocitySource, map: &FlowMap) -> Option<Self> {
         let (dimensions, radius, wraps, has_missing) = match velocity {
             VelocitySource::Analytic(_, domain) => (domain.dimensions, None, false, false),
@@ -84,8 +80,11 @@ impl Layout {
 
 impl Composition {
     /// Traces the displacements over `intervals` equal parts of tau by the tangent flow's Runge-Kutta steps, `steps` per part, with the interpolation,
-    /// boundary and direction of `map`. `None` if particles wrap, leave with an FTLE of 0 or have their own durations, which a displacement does not
-    /// tell. A particle stops in the interval in which that of the nearest node does.
+    /// boundary and direction of `map`. A particle stops in the interval in which that of the nearest node does, and the gradient is that of the map that
+    /// stops it. Outside of the domain it moves as at the edge.
+    ///
+    /// `None` if axes of a box wrap (periodic ones, or `flow.boundary = "periodic"`), with `flow.boundary = "zero"`, and with
+    /// `flow.normalisation = "lifetime"`: a displacement does not tell them.
     ///
     /// # Errors
     /// As [`cpu_tracer`].
@@ -140,11 +139,11 @@ impl Composition {
                     row[component] = (to[component] - from[component]) as f32;
                 }
                 if self.layout.stops {
-                    row[components] = traced.lifetime_share[i];
+                    row[components] = f32::from(u8::from(traced.lifetime_share[i] < SURVIVES));
                 }
             });
         }
-        Table { values: table, intervals: 1 }
+        Table(table)
     }
 
     /// Joins neighbouring intervals until one is left (the hierarchical variant): a sample then takes one look-up instead of one per interval.
@@ -162,24 +161,21 @@ impl Composition {
     fn join(&self, pair: &[Table]) -> Table {
         let mut joint = pair[0].clone();
         let Some(second) = pair.get(1) else { return joint };
-        let (components, intervals) = (self.layout.components(), joint.intervals + second.intervals);
-        let [first_part, second_part] = [joint.intervals, second.intervals].map(|part| part as f64 / intervals as f64);
-        joint.intervals = intervals;
-        joint.values.par_chunks_exact_mut(self.layout.values()).enumerate().for_each(|(node, row)| {
-            let is_over = self.layout.stops && f64::from(row[components]) < SURVIVES;
-            if is_over {
-                row[components] = (first_part * f64::from(row[components])) as f32;
+        let components = self.layout.components();
+        joint.0.par_chunks_exact_mut(self.layout.values()).enumerate().for_each(|(node, row)| {
+            if self.layout.stops && row[components] > 0.0 {
                 return;
             }
             let from = self.state(self.coordinates(node));
             let mut at: State = std::array::from_fn(|i| if i < components { from[i] + f64::from(row[i]) } else { from[i] });
-            let (value, _) = self.interpolate(second, self.place(&at).nodes);
+            let place = self.place(&at);
+            let (value, _) = self.interpolate(second, place.nodes);
             self.advance::<0>(&mut at, &mut [[]; STATE], &value);
             for i in 0..components {
                 row[i] = (at[i] - from[i]) as f32;
             }
             if self.layout.stops {
-                row[components] = (first_part + second_part * value[components]) as f32;
+                row[components] = f32::from(u8::from(self.stops_at(second, place.nodes)));
             }
         });
         joint
@@ -187,7 +183,7 @@ impl Composition {
 
     /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
-        self.tables.iter().map(|table| size_of_val(&table.values[..])).sum()
+        self.tables.iter().map(|table| size_of_val(&table.0[..])).sum()
     }
 
     /// Domain coordinates of a node. Two-dimensional flows are traced in the middle of the slab.
@@ -263,20 +259,21 @@ impl Composition {
         Place { nodes: [longitude, latitude, within(at[3], 2)], on_sphere: Some(here) }
     }
 
-    /// Interpolated values among the nodes and their derivatives along the axes, per node.
-    fn interpolate(&self, table: &Table, place: [f64; 3]) -> ([f64; VALUES], [[f64; 3]; VALUES]) {
-        let ([nx, ny, _], values, axes) = (self.nodes, self.layout.values(), self.layout.dimensions);
+    /// Interpolated displacement among the nodes and its derivatives along the axes, per node.
+    fn interpolate(&self, table: &Table, place: [f64; 3]) -> (State, [[f64; 3]; STATE]) {
+        let ([nx, ny, _], axes) = (self.nodes, self.layout.dimensions);
+        let (values, components) = (self.layout.values(), self.layout.components());
         let (mut low, mut fraction) = ([0; 3], [0.0; 3]);
         for axis in 0..axes {
             low[axis] = (place[axis] as usize).min(self.nodes[axis] - 2);
             fraction[axis] = place[axis] - low[axis] as f64;
         }
-        let (mut value, mut derivative) = ([0.0; VALUES], [[0.0; 3]; VALUES]);
+        let (mut value, mut derivative) = ([0.0; STATE], [[0.0; 3]; STATE]);
         for corner in 0..1 << axes {
             let high = |axis: usize| corner >> axis & 1;
             let weight = |axis: usize| if high(axis) == 1 { fraction[axis] } else { 1.0 - fraction[axis] };
             let node = (low[0] + high(0)) + nx * ((low[1] + high(1)) + ny * (if axes == 3 { low[2] + high(2) } else { 0 }));
-            let row = &table.values[values * node..values * (node + 1)];
+            let row = &table.0[values * node..values * node + components];
             let all: f64 = (0..axes).map(weight).product();
             let mut slopes = [0.0; 3];
             for axis in 0..axes {
@@ -293,11 +290,11 @@ impl Composition {
         (value, derivative)
     }
 
-    /// Whether the particle of the nearest node stops in the intervals of a table.
+    /// Whether the particle of the nearest node stops in the interval of a table.
     fn stops_at(&self, table: &Table, place: [f64; 3]) -> bool {
         let ([nx, ny, _], values) = (self.nodes, self.layout.values());
         let [x, y, z]: [usize; 3] = std::array::from_fn(|axis| (place[axis].round() as usize).min(self.nodes[axis] - 1));
-        self.layout.stops && f64::from(table.values[values * (x + nx * (y + ny * z)) + values - 1]) < SURVIVES
+        self.layout.stops && table.0[values * (x + nx * (y + ny * z)) + values - 1] > 0.0
     }
 
     /// Changes of the place among the nodes for a change of the state.
@@ -314,7 +311,7 @@ impl Composition {
     }
 
     /// Adds a displacement to a state, whose tangent has what was added already; both stay on the sphere.
-    fn advance<const C: usize>(&self, at: &mut State, tangent: &mut [[f64; C]; STATE], value: &[f64; VALUES]) {
+    fn advance<const C: usize>(&self, at: &mut State, tangent: &mut [[f64; C]; STATE], value: &State) {
         (0..self.layout.components()).for_each(|i| at[i] += value[i]);
         if self.globe.is_none() {
             return;
@@ -342,17 +339,7 @@ impl Composition {
         let (mut at, mut tangent) = (self.state(seed), self.initial_tangent::<C>(seed));
         for table in &self.tables {
             let place = self.place(&at);
-            let (value, mut derivative) = self.interpolate(table, place.nodes);
-            let share = value[components];
-            if self.layout.stops && share < SURVIVES {
-                // A particle keeps the gradient that it has when it stops; the displacement also changes since neighbours stop sooner or later.
-                for i in 0..components {
-                    for axis in 0..3 {
-                        let by_time = if share > 0.0 { value[i] / share * derivative[components][axis] } else { derivative[i][axis] };
-                        derivative[i][axis] -= by_time;
-                    }
-                }
-            }
+            let (value, derivative) = self.interpolate(table, place.nodes);
             for c in 0..C {
                 let change = self.differentials(&place, std::array::from_fn(|i| tangent[i][c]));
                 for i in 0..components {

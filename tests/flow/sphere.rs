@@ -2,15 +2,13 @@
 
 use crate::kit::flow::{DAY, EVERYTHING, cross, direction, dot, rotation, trace};
 use ridgewatch::field::{Axis, DomainPoint, EARTH_RADIUS, Geometry, Grid, Snapshot, UnitPoint, Window};
-use ridgewatch::flow::{
-    Boundary, Composition, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource,
-};
+use ridgewatch::flow::{Boundary, Composition, Direction, FlowMap, Integrator, Interpolation, Precision, Traced, VelocitySource};
 use std::f64::consts::TAU;
 use std::sync::Arc;
 
 const TOP: f64 = 20_000.0;
 
-fn map(tau: f64, steps: usize, precision: Precision, interpolation: Interpolation) -> FlowMap {
+pub(crate) fn map(tau: f64, steps: usize, precision: Precision, interpolation: Interpolation) -> FlowMap {
     FlowMap { precision, difference_step: 1e-3, boundary: Boundary::Stop, interpolation, ..FlowMap::tangent(tau, steps) }
 }
 
@@ -58,8 +56,8 @@ fn traced(source: &VelocitySource, map: &FlowMap, seeds: &[DomainPoint]) -> Trac
     trace(source, map, 0.0, seeds, EVERYTHING)
 }
 
-fn greatest(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+pub(crate) fn greatest(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, |worst, error| if error > worst || error.is_nan() { error } else { worst })
 }
 
 /// Direction of a point.
@@ -335,88 +333,4 @@ fn composed_maps_go_over_poles_and_the_dateline() {
             assert!(fine[kind] < 0.65 * coarse[kind] && fine[kind] < 0.01, "{name}: {coarse:?} {fine:?}");
         }
     }
-}
-
-/// A box of nodes in which `flow` holds at the given times; linear between them.
-fn in_a_box(axes: Vec<Axis>, times: [f64; 2], flow: impl Fn([f64; 3], f64) -> [f32; 3]) -> VelocitySource {
-    let grid = Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
-    let [nx, ny, _] = grid.shape();
-    let at = |k: usize, i: usize| grid.axes.get(k).map_or(0.0, |axis| axis.coordinates()[i]);
-    let mut window = Window::new(times[1] - times[0]);
-    for time in times {
-        let all: Vec<[f32; 3]> = (0..grid.nodes()).map(|i| flow([at(0, i % nx), at(1, i / nx % ny), at(2, i / (nx * ny))], time)).collect();
-        let component = |c: usize| all.iter().map(|v| v[c]).collect::<Vec<f32>>();
-        window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &component(0), &component(1), &component(2)))).unwrap();
-    }
-    VelocitySource::Window(Arc::new(window))
-}
-
-fn metres(name: &str, low: f64, high: f64, nodes: usize) -> Axis {
-    Axis::uniform(name, "m", low, high, nodes).unwrap()
-}
-
-/// Greatest error of composed flow maps, plain and hierarchical, at unit points.
-fn composed_in_a_box(source: &VelocitySource, map: &FlowMap, nodes: [usize; 3], unit: &[UnitPoint], expected: &[f64]) -> [f64; 2] {
-    let plain = Composition::trace(source, map, 0.0, nodes, 8, 25).unwrap().unwrap();
-    [plain.clone(), plain.joined()].map(|composition| {
-        let mut found = vec![0.0; unit.len()];
-        composition.log_stretch(unit, &mut found);
-        greatest(&found, expected)
-    })
-}
-
-#[test]
-fn composed_maps_keep_what_stops() {
-    // x grows as exp(a t). Particles rise by 2 t - 2 t^2, up and down again, and those of the upper half stop at the top on the way: where x is 0,
-    // ln stretch is a t at that time, a quadratic equation, and a tau for the others.
-    let (a, tau) = (2.0, 1.0);
-    let axes = vec![metres("x", -1.0, 1.0, 33), metres("y", 0.0, 1.0, 3), metres("z", 0.0, 1.0, 17)];
-    let source = in_a_box(axes, [0.0, tau], |[x, _, _], time| [(a * x) as f32, 0.0, (2.0 - 4.0 * time) as f32]);
-    let map = map(tau, 200, Precision::F64, Interpolation::Linear);
-    // Between them the stretch jumps.
-    let heights = (0..40).map(|i| (i as f32 + 0.5) / 40.0).filter(|z| (z - 0.5).abs() > 0.05);
-    let unit: Vec<UnitPoint> = heights.map(|z| UnitPoint([0.5, 0.5, z])).collect();
-    let until = |z: f64| if z < 0.5 { tau } else { 0.5 * (1.0 - (2.0 * z - 1.0).sqrt()) };
-    let expected: Vec<f64> = unit.iter().map(|point| a * until(f64::from(point.0[2]))).collect();
-    let worst = composed_in_a_box(&source, &map, [129, 3, 65], &unit, &expected);
-    assert!(worst.iter().all(|&worst| worst < 0.05), "{worst:?}");
-}
-
-#[test]
-fn composed_maps_do_not_stretch_because_neighbours_stop_later() {
-    // A uniform flow leaves through two edges, which lie where f32 rounds outwards: wherever a particle stops, it has not stretched.
-    let axes = vec![metres("x", 0.7, 1.7, 9), metres("y", 0.1, 1.1, 9)];
-    let source = in_a_box(axes, [0.0, 1.0], |_, _| [0.4, 1.2, 0.0]);
-    let map = map(1.0, 200, Precision::F64, Interpolation::Linear);
-    let unit: Vec<UnitPoint> = (0..400).map(|i| UnitPoint([(i % 20) as f32 / 19.0, (i / 20) as f32 / 19.0, 0.5])).collect();
-    let worst = composed_in_a_box(&source, &map, [33, 33, 1], &unit, &vec![0.0; unit.len()]);
-    assert!(worst.iter().all(|&worst| worst < 1e-3), "{worst:?}");
-}
-
-#[test]
-fn composed_maps_refuse_what_displacements_do_not_tell() {
-    let axes = || vec![metres("x", 0.0, 1.0, 9), metres("y", 0.0, 1.0, 9)];
-    let still = |axes| in_a_box(axes, [0.0, 1.0], |_, _| [0.0; 3]);
-    let [x, y] = <[Axis; 2]>::try_from(axes()).unwrap();
-    let (open, wraps) = (still(axes()), still(vec![x.with_period(1.125), y]));
-    let usual = map(1.0, 10, Precision::F64, Interpolation::Linear);
-    let values = |source: &VelocitySource, map: &FlowMap| Composition::values_per_node(source, map);
-    assert_eq!(values(&open, &usual), Some(3), "two components and a share");
-    assert_eq!(values(&open, &FlowMap { boundary: Boundary::Clamp, ..usual.clone() }), Some(2));
-    assert_eq!(values(&wraps, &usual), None, "an axis that wraps");
-    for map in [
-        FlowMap { boundary: Boundary::Periodic, ..usual.clone() },
-        FlowMap { boundary: Boundary::Zero, ..usual.clone() },
-        FlowMap { normalisation: Normalisation::Lifetime, ..usual.clone() },
-    ] {
-        assert_eq!(values(&open, &map), None, "{map:?}");
-        assert!(Composition::trace(&open, &map, 0.0, [9, 9, 1], 2, 5).unwrap().is_none());
-    }
-    // Without a velocity a particle stops under any policy.
-    let holed = in_a_box(axes(), [0.0, 1.0], |[x, _, _], _| [if x > 0.8 { f32::NAN } else { 1.0 }, 0.0, 0.0]);
-    let clamp = FlowMap { boundary: Boundary::Clamp, ..usual };
-    assert_eq!(values(&holed, &clamp), Some(3));
-    let unit: Vec<UnitPoint> = (0..20).map(|i| UnitPoint([(i as f32 + 0.5) / 20.0, 0.5, 0.5])).collect();
-    let worst = composed_in_a_box(&holed, &clamp, [33, 9, 1], &unit, &vec![0.0; unit.len()]);
-    assert!(worst.iter().all(|&worst| worst < 0.05), "beside missing cells: {worst:?}");
 }
