@@ -91,8 +91,8 @@ fn of_ftle(panel: &FtlePanel, chart: &Chart, said: &mut Vec<String>) {
             said.push(if best.is_finite() {
                 format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.")
             } else {
-                let why = chart.not_measured.iter().find_map(|line| line.strip_prefix(class)?.strip_prefix(": "));
-                format!("{class}: not measured{}.", why.map_or(String::new(), |why| format!(", {why}")))
+                let why = chart.not_measured.iter().filter(|line| line.starts_with(class)).find_map(|line| line.split_once(": "));
+                format!("{class}: not measured{}.", why.map_or(String::new(), |(_, why)| format!(", {why}")))
             });
             continue;
         }
