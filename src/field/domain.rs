@@ -50,6 +50,13 @@ impl Domain {
         std::array::from_fn(|k| extent[k] * self.scale[k])
     }
 
+    /// Corners of the closed box in single precision, rounded inward: no point between them lies outside of it.
+    pub fn inward_corners(&self) -> [[f32; 3]; 2] {
+        let low = self.min.map(|value| if f64::from(value as f32) < value { (value as f32).next_up() } else { value as f32 });
+        let high = self.max.map(|value| if f64::from(value as f32) > value { (value as f32).next_down() } else { value as f32 });
+        [low, high]
+    }
+
     /// Converts unit coordinates in [0, 1] to domain coordinates.
     pub fn from_unit(&self, unit: UnitPoint) -> DomainPoint {
         let extent = self.extent();

@@ -196,12 +196,8 @@ impl Composition {
 
     /// The seed of a node, in single precision and not outside of the domain.
     fn seed(&self, node: usize) -> DomainPoint {
-        let at = self.coordinates(node);
-        DomainPoint(std::array::from_fn(|axis| match at[axis] as f32 {
-            x if f64::from(x) < self.domain.min[axis] => x.next_up(),
-            x if f64::from(x) > self.domain.max[axis] => x.next_down(),
-            x => x,
-        }))
+        let (at, [low, high]) = (self.coordinates(node), self.domain.inward_corners());
+        DomainPoint(std::array::from_fn(|axis| (at[axis] as f32).max(low[axis]).min(high[axis])))
     }
 
     /// State at domain coordinates.

@@ -42,7 +42,7 @@ pub struct SceneBox {
     cell_edge: [f64; 3],
     /// Domain units per majorant cell.
     cell_extent: [f64; 3],
-    /// Corners of the closed box in f32, rounded inward, so that no query lies outside of it.
+    /// [`Domain::inward_corners`], so that no query lies outside of the box.
     inward_min: [f32; 3],
     inward_max: [f32; 3],
     cells: [i32; 3],
@@ -53,20 +53,13 @@ impl SceneBox {
     /// A box around `domain` (edges times `scale` in scene units) with this number of majorant cells per axis.
     pub fn new(domain: &Domain, scale: [f64; 3], cells: [usize; 3]) -> Self {
         let extent = domain.extent();
-        let inward = |value: f64, up: bool| {
-            let nearest = value as f32;
-            match up {
-                true if f64::from(nearest) < value => nearest.next_up(),
-                false if f64::from(nearest) > value => nearest.next_down(),
-                _ => nearest,
-            }
-        };
+        let [inward_min, inward_max] = domain.inward_corners();
         Self {
             min: std::array::from_fn(|k| domain.min[k] * scale[k]),
             max: std::array::from_fn(|k| domain.max[k] * scale[k]),
             domain_min: domain.min,
-            inward_min: domain.min.map(|v| inward(v, true)),
-            inward_max: domain.max.map(|v| inward(v, false)),
+            inward_min,
+            inward_max,
             cell_edge: std::array::from_fn(|k| extent[k] * scale[k] / cells[k] as f64),
             cell_extent: std::array::from_fn(|k| extent[k] / cells[k] as f64),
             cells: cells.map(|n| n as i32),
