@@ -249,16 +249,6 @@ struct Built {
 }
 
 impl Bench<'_, '_> {
-    /// As [`Charting::with_share`].
-    #[cfg(feature = "cuda")]
-    fn with_share<T>(&mut self, share: f64, work: impl FnOnce(&mut Self) -> T) -> T {
-        let (whole, end) = (self.charting.ends, self.charting.end_of_share(share));
-        self.charting.ends = end;
-        let result = work(self);
-        self.charting.ends = whole;
-        result
-    }
-
     /// Nodes are traced by this tracer of the CPU from now on.
     #[cfg(feature = "cuda")]
     fn time_nodes_by(&mut self, tracer: &dyn Tracer) {
@@ -401,7 +391,9 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             }
             tables(&mut bench, &mut backend)?;
             differences(&mut bench, &mut backend, steps)?;
-            bench.with_share(NETWORKS_SHARE, |bench| networks(bench, &mut backend))?;
+            let whole = bench.charting.begin_share(NETWORKS_SHARE);
+            networks(&mut bench, &mut backend)?;
+            bench.charting.ends = whole;
             // They have no kernels.
             let chosen = FlowMap { steps: Steps::Fixed(steps), ..opened.plan.map.clone() };
             bench.time_nodes_by(&*opened.on_cpu(&chosen)?);

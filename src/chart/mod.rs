@@ -129,15 +129,16 @@ impl Charting<'_> {
 
     /// Runs work with another end: after the given share of the time that is left.
     fn with_share<T>(&mut self, share: f64, work: impl FnOnce(&mut Self) -> T) -> T {
-        let (whole, end) = (self.ends, self.end_of_share(share));
-        self.ends = end;
+        let whole = self.begin_share(share);
         let result = work(self);
         self.ends = whole;
         result
     }
 
-    fn end_of_share(&self, share: f64) -> Instant {
-        Instant::now() + Duration::from_secs_f64(share * self.left())
+    /// Moves the end to the given share of the time that is left, and returns the end before.
+    fn begin_share(&mut self, share: f64) -> Instant {
+        let end = Instant::now() + Duration::from_secs_f64(share * self.left());
+        std::mem::replace(&mut self.ends, end)
     }
 
     fn left(&self) -> f64 {
