@@ -1,10 +1,10 @@
 //! Measures the time to error after a slide: the seconds from a new window until the picture has 30, 35, 40 and 45 dB over lit pixels and keeps them, for
 //! five slides seen by three cameras. Runs on a GPU if there is one. Prints a table, and what each slide took to standard error.
 //!
-//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [cameras=1..3] [table.key=value]`: frames a slide; a method of smooth frames, `auto`, `gated` or
-//! `reference`, with samples per pixel and frame of its own if given. The seconds of `auto` have its races in them. The truth is the mean of two halves of `reference`; the product of the
-//! differences to the halves is the squared error without their noise, up to a bound that their samples set. The first slide, which compiles
-//! kernels, is not counted. The source needs six slides.
+//! `-- CONFIG TRUTH_SAMPLES FRAMES METHOD[:SURROGATE][*SAMPLES] ... [cameras=1..3] [table.key=value]`: frames a slide; a method of smooth frames,
+//! `auto`, `gated` or `reference`, with samples per pixel and frame of its own if given. The seconds of `auto` have its races in them. The truth is the
+//! mean of two halves of `reference`; the product of the differences to the halves is the squared error without their noise, up to a bound that their
+//! samples set. The first slide, which compiles kernels, is not counted. The source needs six slides.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -146,6 +146,7 @@ fn main() {
             scene.render.samples = candidate.samples.unwrap_or(scene.render.samples);
             eprint!("\n{}, camera {number}", candidate.name);
             all.extend(measure(&scene, &truths, &device));
+            eprintln!();
         }
     }
     let pictures = cameras * (SLIDES - 1);
