@@ -385,9 +385,14 @@ fn missing_cells_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
     out
 }
 
+/// `UnitBox` of the kernels.
+fn unit_box_bytes(domain: &Domain) -> Vec<u8> {
+    [bytes(&[domain.min, domain.extent()]), bytes(&domain.inward_corners())].concat()
+}
+
 /// Domain, gate, missing cells and table in the harness's input format. Without a gate RK4 answers everywhere.
 fn answer_setup_bytes(domain: &Domain, spent: bool, gate: Option<&Gate>, missing_cells: &[u8], table: &Table) -> Vec<u8> {
-    let mut out = bytes(&[domain.min, domain.extent()]);
+    let mut out = unit_box_bytes(domain);
     out.extend(bytes(&[i32::from(spent)]));
     match gate {
         Some(gate) => {

@@ -56,6 +56,22 @@ RW_FN double max_(double a, double b) { return fmax(a, b); }
 RW_FN int min_(int a, int b) { return a < b ? a : b; }
 RW_FN int max_(int a, int b) { return a > b ? a : b; }
 
+// Product and sum that the compiler never fuses, since the CPU's are not fused.
+RW_FN double times(double a, double b) {
+#if RW_DEVICE
+    return __dmul_rn(a, b);
+#else
+    return a * b;
+#endif
+}
+RW_FN double plus(double a, double b) {
+#if RW_DEVICE
+    return __dadd_rn(a, b);
+#else
+    return a + b;
+#endif
+}
+
 RW_FN bool is_nan(float a) { return a != a; }
 RW_FN bool is_nan(double a) { return a != a; }
 

@@ -72,10 +72,10 @@ extern "C" __global__ void __launch_bounds__(256)
 network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t first, uint32_t n, float* __restrict__ points) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
     if (i >= n) return;
-    for (int k = 0; k < 3; ++k) {
-        const double unit = double(mix(seed, 3 * (first + i) + k) >> 40) / double(1u << 24);
-        points[3 * size_t(i) + k] = float(domain.min[k] + unit * domain.extent[k]);
-    }
+    float unit[3], point[3];
+    for (int k = 0; k < 3; ++k) unit[k] = float(mix(seed, 3 * (first + i) + k) >> 40) / float(1u << 24);
+    from_unit(domain, unit, point);
+    for (int k = 0; k < 3; ++k) points[3 * size_t(i) + k] = point[k];
 }
 
 // Turns traced points and their labels into samples, as `write_sample` does. One thread per point.

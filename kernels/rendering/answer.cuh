@@ -20,7 +20,7 @@ struct Choice {
     int budget_spent;
     int pad;
 };
-static_assert(sizeof(Choice) == 176, "layout");
+static_assert(sizeof(Choice) == 200, "layout");
 
 // Sets `unit` to the point in unit coordinates, unless nobody answers.
 RW_FN Answerer choose(const Choice& choice, const float point[3], float (&unit)[3]) {

@@ -15,7 +15,7 @@ struct AuditDraw {
     UnitBox domain;
     MissingCells missing_cells;
 };
-static_assert(sizeof(AuditDraw) == 176, "layout");
+static_assert(sizeof(AuditDraw) == 200, "layout");
 
 // Cells `first` to `first` + `count`. The points of a cell are numbers begins[cell] to begins[cell + 1] of all points; the batch's arrays start
 // with the points of its first cell.
@@ -43,8 +43,7 @@ extern "C" __global__ void __launch_bounds__(256) audit_draw(const __grid_consta
     for (uint32_t number = batch.begins[cell] + lane; number < end; number += 32u) {
         float drawn[3], point[3], unit_point[3];
         audit_point(draw.cells, cell, number, drawn);
-        // Equals Domain::from_unit, which does not fuse multiply and add.
-        for (int k = 0; k < 3; ++k) point[k] = float(plus(draw.domain.min[k], times(draw.domain.extent[k], double(drawn[k]))));
+        from_unit(draw.domain, drawn, point);
         // The surrogate predicts at the rounded point, which is the one that is traced.
         to_unit(draw.domain, point, unit_point);
         const size_t i = number - skip;

@@ -6,22 +6,6 @@
 
 namespace rw {
 
-// Product and sum that the compiler never fuses, since the CPU's are not fused.
-RW_FN double times(double a, double b) {
-#if RW_DEVICE
-    return __dmul_rn(a, b);
-#else
-    return a * b;
-#endif
-}
-RW_FN double plus(double a, double b) {
-#if RW_DEVICE
-    return __dadd_rn(a, b);
-#else
-    return a + b;
-#endif
-}
-
 struct AuditCells {
     int shape[3];
     uint32_t key[2];

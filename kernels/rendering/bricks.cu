@@ -31,10 +31,10 @@ extern "C" __global__ void __launch_bounds__(256)
 brick_points(const Table nodes, const __grid_constant__ UnitBox domain, const uint2* __restrict__ list, float* __restrict__ points) {
     const uint2 brick = list[blockIdx.x];
     for_nodes(nodes, brick.x, [&](uint32_t i, const int (&node)[3]) {
-        for (int k = 0; k < 3; ++k) {
-            const float unit = k < nodes.dimensions ? float(node[k]) / float(nodes.nodes[k] - 1) : 0.5f;
-            points[3 * (size_t(brick.y) + i) + k] = float(domain.min[k] + domain.extent[k] * double(unit));
-        }
+        float unit[3], point[3];
+        for (int k = 0; k < 3; ++k) unit[k] = k < nodes.dimensions ? float(node[k]) / float(nodes.nodes[k] - 1) : 0.5f;
+        from_unit(domain, unit, point);
+        for (int k = 0; k < 3; ++k) points[3 * (size_t(brick.y) + i) + k] = point[k];
     });
 }
 

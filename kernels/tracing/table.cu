@@ -1,4 +1,5 @@
 // The table surrogate: seeds at its nodes, repair of values that are not finite, and multilinear lookups.
+#include "common/domain.cuh"
 #include "tracing/table.cuh"
 
 using namespace rw;
@@ -6,10 +7,10 @@ using namespace rw;
 struct TableFrame {
     int nodes[3];
     int dimensions;
-    double min[3], extent[3];
+    UnitBox domain;
 };
 
-// Seeds at the nodes, {x, y, z, node index}, in domain coordinates equal to Domain::from_unit. Bricks of 8x8x8 nodes (8x8 in the plane), each in
+// Seeds at the nodes, {x, y, z, node index}. Bricks of 8x8x8 nodes (8x8 in the plane), each in
 // Morton order, keep neighbours together without a sort. Nodes beyond the table get the index 0xffffffff. `first`: number of the first seed in
 // the sequence of all bricks' nodes.
 extern "C" __global__ void __launch_bounds__(256)
@@ -34,13 +35,13 @@ table_bricks(const TableFrame frame, uint32_t bricks_x, uint32_t bricks_y, uint6
     node[1] += uint32_t(brick / bricks_x % bricks_y) * 8;
     node[2] += frame.dimensions == 3 ? uint32_t(brick / (uint64_t(bricks_x) * bricks_y)) * 8 : 0;
     bool in_table = true;
-    float p[3];
+    float unit[3], p[3];
 #pragma unroll
     for (int k = 0; k < 3; k++) {
         in_table = in_table && node[k] < uint32_t(frame.nodes[k]);
-        const float unit = k < frame.dimensions ? float(node[k]) / float(frame.nodes[k] - 1) : 0.5f;
-        p[k] = float(frame.min[k] + frame.extent[k] * double(unit));
+        unit[k] = k < frame.dimensions ? float(node[k]) / float(frame.nodes[k] - 1) : 0.5f;
     }
+    from_unit(frame.domain, unit, p);
     const uint32_t index = (node[2] * uint32_t(frame.nodes[1]) + node[1]) * uint32_t(frame.nodes[0]) + node[0];
     sorted[i] = make_float4(p[0], p[1], p[2], __uint_as_float(in_table ? index : 0xffffffffu));
 }

@@ -57,10 +57,10 @@ impl Domain {
         [low, high]
     }
 
-    /// Converts unit coordinates in [0, 1] to domain coordinates.
+    /// Converts unit coordinates in [0, 1] to domain coordinates, which lie in the closed box: rounding never leads out of it.
     pub fn from_unit(&self, unit: UnitPoint) -> DomainPoint {
-        let extent = self.extent();
-        DomainPoint(std::array::from_fn(|k| (self.min[k] + extent[k] * f64::from(unit.0[k])) as f32))
+        let (extent, [low, high]) = (self.extent(), self.inward_corners());
+        DomainPoint(std::array::from_fn(|k| ((self.min[k] + extent[k] * f64::from(unit.0[k])) as f32).max(low[k]).min(high[k])))
     }
 
     /// Converts domain coordinates to unit coordinates, clamped to [0, 1].
@@ -77,5 +77,27 @@ impl Domain {
     /// True if the point lies in the closed box.
     pub fn contains(&self, point: DomainPoint) -> bool {
         (0..3).all(|k| f64::from(point.0[k]) >= self.min[k] && f64::from(point.0[k]) <= self.max[k])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_of_the_unit_cube_lie_inside() {
+        // Corners that single precision rounds either way, and one whose edge is shorter than a step of it.
+        for (low, high) in [
+            ([0.7, -0.1, 1e-3], [1.7, 0.3, 0.9]),
+            ([-1.7, 100.1, -0.3], [-0.7, 200.3, 1.1]),
+            ([1e7 + 0.3, -2.0, 0.0], [1e7 + 3.2, 0.1, 0.7]),
+        ] {
+            let domain = Domain::cuboid(low, high);
+            for i in 0..27 {
+                let unit = UnitPoint([i % 3, i / 3 % 3, i / 9].map(|at| at as f32 * 0.5));
+                let point = domain.from_unit(unit);
+                assert!(domain.contains(point), "{unit:?} of {domain:?}: {point:?}");
+            }
+        }
     }
 }

@@ -2,7 +2,8 @@
 
 use crate::sphere::{greatest, map};
 use ridgewatch::field::{Axis, Geometry, Grid, Snapshot, UnitPoint, Window};
-use ridgewatch::flow::{Boundary, Composition, FlowMap, Interpolation, Normalisation, Precision, VelocitySource};
+use ridgewatch::flow::{Boundary, Composition, FlowMap, Interpolation, Normalisation, Precision, VelocitySource, cpu_tracer};
+use ridgewatch::surrogate::Table;
 use std::sync::Arc;
 
 /// A box of nodes in which `flow` holds at the given times; linear between them.
@@ -51,7 +52,7 @@ fn composed_maps_keep_what_stops() {
 }
 
 #[test]
-fn nodes_on_an_edge_start_inside() {
+fn what_starts_on_an_edge_starts_inside() {
     // Particles move away from an edge that f32 rounds outwards, along a line from which others part as exp(a t).
     let (a, tau) = (1.0, 1.0);
     let axes = vec![metres("x", 0.7, 1.7, 9), metres("y", 0.1, 1.1, 9)];
@@ -60,6 +61,10 @@ fn nodes_on_an_edge_start_inside() {
     let unit: Vec<UnitPoint> = (0..40).map(|i| UnitPoint([i as f32 / 100.0, 0.5, 0.5])).collect();
     let worst = composed_in_a_box(&source, &map, [33, 129, 1], &unit, &vec![a * tau; unit.len()]);
     assert!(worst.iter().all(|&worst| worst < 0.05), "{worst:?}");
+    // Nodes of tables, too, of which the outermost lie on all four edges; those above and below leave at once.
+    let table = Table::trace(&cpu_tracer(source, &map, 0.0).unwrap(), [33, 129, 1]).unwrap();
+    let middle = &table.values()[64 * 33..][..33];
+    assert!(middle.iter().take(26).all(|value| (f64::from(*value) - a * tau).abs() < 1e-3), "{middle:?}");
 }
 
 #[test]

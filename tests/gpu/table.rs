@@ -2,6 +2,7 @@
 
 use super::scenes::*;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceTable, OnGpu, Tuning};
+use ridgewatch::field::Axis;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, VelocitySource, cpu_tracer};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostSurrogate, Hybrid, Kind, Predict, SurrogateSettings, SurrogateTable as _, Table, build};
@@ -103,6 +104,24 @@ fn a_table_of_a_run_stays_on_the_device() {
         restored.predict(&points, &mut here).unwrap();
         // Seven interpolations between values of up to 5, each rounded once or, where the CPU does not fuse, twice.
         assert!(there.iter().zip(&here).all(|(a, b)| (a - b).abs() <= 5e-6), "on the device and on the host");
+    }
+}
+
+/// Nodes on edges that single precision rounds outwards are traced from within, as on the CPU.
+#[test]
+#[ignore = "needs a GPU"]
+fn what_starts_on_an_edge_starts_inside() {
+    let axes = [(0.7, 1.7), (0.1, 1.1), (-1.7, -0.7)].into_iter().zip(["x", "y", "z"]);
+    let source = smooth(&cartesian(axes.map(|((low, high), name)| Axis::uniform(name, "", low, high, 9).unwrap()).collect()), 0.05, false);
+    for boundary in [Boundary::Stop, Boundary::Clamp] {
+        let map = FlowMap { boundary, precision: Precision::F64, ..map(3.0, 30) };
+        let tracer = CudaTracer::new(store(), &gpu(), source.clone(), &map, 0.0, Tuning::default()).unwrap();
+        let (there, here) = (values(&on_device(&tracer, [17, 17, 17])), on_host(&source, &map, [17, 17, 17]));
+        let (there, here) = (there.values(), here.table().unwrap().values());
+        let moves = (0..17 * 17).filter(|i| here[i * 17] != 0.0).count();
+        assert!(moves > 17 * 17 / 4, "{boundary:?}: {moves} nodes of the lower edge move into the domain");
+        let apart = there.iter().zip(here).filter(|(there, here)| (*there - *here).abs() > 1e-4).count();
+        assert!(apart <= 17 * 17 * 17 / 500, "{boundary:?}: {apart} nodes differ");
     }
 }
 

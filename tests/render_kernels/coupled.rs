@@ -70,7 +70,7 @@ fn round(
 ) -> Round {
     let setup = renderer.round_setup(5);
     let cells = setup.majorants.len();
-    let mut input = [bytes(&[domain().min, domain().extent()]), bytes(&[0_i32; 4]), missing_cells.to_vec()].concat();
+    let mut input = [unit_box_bytes(&domain()), bytes(&[0_i32; 4]), missing_cells.to_vec()].concat();
     input.extend(table_bytes(table, dimensions));
     input.extend(bytes(&[u32::from(equal)]));
     input.extend(setup.parameters.as_bytes());

@@ -2,6 +2,7 @@
 
 use bytemuck::{NoUninit, Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
+use ridgewatch_field::Domain;
 use ridgewatch_simd::Real;
 use ridgewatch_trust::CellErrors;
 use std::fmt::Debug;
@@ -131,14 +132,30 @@ pub struct SortFrame {
     pub last_cell: [f32; 3],
 }
 
+/// `UnitBox` of `domain.cuh`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct UnitBoxArgument {
+    pub min: [f64; 3],
+    pub extent: [f64; 3],
+    pub low: [f32; 3],
+    pub high: [f32; 3],
+}
+
+impl UnitBoxArgument {
+    pub fn new(domain: &Domain) -> Self {
+        let [low, high] = domain.inward_corners();
+        Self { min: domain.min, extent: domain.extent(), low, high }
+    }
+}
+
 /// `TableFrame` of `table.cu`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct TableFrame {
     pub nodes: [i32; 3],
     pub dimensions: i32,
-    pub min: [f64; 3],
-    pub extent: [f64; 3],
+    pub domain: UnitBoxArgument,
 }
 
 /// `Table` of `table.cuh`.
@@ -170,12 +187,11 @@ pub struct MissingCellsArgument {
     pub missing: u64,
 }
 
-/// `Choice` of `answer.cuh`, including its domain and gate.
+/// `Choice` of `answer.cuh`, including its gate.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ChoiceArgument {
-    pub min: [f64; 3],
-    pub extent: [f64; 3],
+    pub domain: UnitBoxArgument,
     pub gate_shape: [i32; 3],
     pub gate_pad: i32,
     pub trusted: u64,
@@ -217,8 +233,7 @@ pub struct AuditDrawArgument {
     pub shape: [i32; 3],
     pub key: [u32; 2],
     pub stream: [u32; 3],
-    pub min: [f64; 3],
-    pub extent: [f64; 3],
+    pub domain: UnitBoxArgument,
     pub missing_cells: MissingCellsArgument,
 }
 
@@ -262,7 +277,7 @@ macro_rules! device_repr {
 }
 pub(super) use device_repr;
 
-device_repr!(ResultPolicy, Outputs, SortFrame, TableFrame, TableArgument, ChoiceArgument, ListsArgument, LabelsArgument);
+device_repr!(ResultPolicy, Outputs, SortFrame, UnitBoxArgument, TableFrame, TableArgument, ChoiceArgument, ListsArgument, LabelsArgument);
 device_repr!(AuditDrawArgument, AuditBatchArgument, AuditPointsArgument, CellFindings);
 
 /// A kernel parameter whose type depends on the precision, as eight-byte words.
@@ -287,11 +302,11 @@ mod tests {
         assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (336, 488));
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
         assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<ResultPolicy>()), (56, 40, 12));
-        assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
+        assert_eq!((size_of::<SortFrame>(), size_of::<UnitBoxArgument>(), size_of::<TableFrame>()), (52, 72, 88));
         // static_asserts in the kernels' sources have the same numbers.
-        assert_eq!((size_of::<TableArgument>(), size_of::<MissingCellsArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));
+        assert_eq!((size_of::<TableArgument>(), size_of::<MissingCellsArgument>(), size_of::<ChoiceArgument>()), (24, 96, 200));
         assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (56, 40));
-        assert_eq!((size_of::<AuditDrawArgument>(), size_of::<AuditBatchArgument>()), (176, 16));
+        assert_eq!((size_of::<AuditDrawArgument>(), size_of::<AuditBatchArgument>()), (200, 16));
         assert_eq!((size_of::<AuditPointsArgument>(), size_of::<CellFindings>()), (56, 80));
     }
 

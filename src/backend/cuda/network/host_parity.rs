@@ -2,8 +2,9 @@
 //! of the loss with derivatives. Needs no GPU.
 
 use crate::cuda::host_parity::{half, library};
-use crate::cuda::network::layout::{GridArgument, ReadingArgument, UnitBoxArgument};
-use crate::cuda::network::network::{LossTerms, TangentTerm, further_places, grid, network_defines, placed_times, reading, unit_box};
+use crate::cuda::layout::UnitBoxArgument;
+use crate::cuda::network::layout::{GridArgument, ReadingArgument};
+use crate::cuda::network::network::{LossTerms, TangentTerm, further_places, grid, network_defines, placed_times, reading};
 use crate::router::unit_jacobian;
 use ridgewatch_field::{Domain, DomainPoint, UnitPoint};
 use ridgewatch_surrogate::Samples;
@@ -162,7 +163,7 @@ fn check_gradient(name: &str, settings: &NetworkSettings, axes: &[usize]) {
                 &levels,
                 halves.as_ptr(),
                 layers.as_ptr(),
-                &unit_box(&domain),
+                &UnitBoxArgument::new(&domain),
                 &given,
                 points.as_ptr().cast(),
                 arrivals.as_ptr().cast(),

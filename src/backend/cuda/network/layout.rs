@@ -94,15 +94,7 @@ pub struct AdamArgument {
     pub gradient: f32,
 }
 
-/// `UnitBox` of `answer.cuh`.
-#[repr(C)]
-#[derive(Debug, Clone, Copy)]
-pub struct UnitBoxArgument {
-    pub min: [f64; 3],
-    pub extent: [f64; 3],
-}
-
-device_repr!(GridArgument, ReadingArgument, DrawArgument, AdamArgument, UnitBoxArgument);
+device_repr!(GridArgument, ReadingArgument, DrawArgument, AdamArgument);
 
 #[cfg(test)]
 mod tests {
@@ -112,6 +104,6 @@ mod tests {
     fn sizes_are_those_of_cpp() {
         // static_asserts in the kernels' sources have the same numbers.
         assert_eq!(size_of::<ReadingArgument>(), 128);
-        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (64, 16, 48));
+        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>()), (64, 16));
     }
 }

@@ -11,7 +11,6 @@ mod samples;
 mod training;
 
 pub use batched::Tiling;
-pub(super) use layout::UnitBoxArgument;
 pub use network::{DeviceNetwork, LossTerms, NetworkAbove, is_fused, network_defines};
 pub use resident::{CudaTable, CudaTraining, OnGpu};
 pub(super) use resident::{LabelPool, LabelSink, frozen_parts, seconds_of_prediction, trace_labels};

@@ -8,10 +8,10 @@ use crate::cuda::driver::Resident;
 use crate::cuda::driver_error;
 use crate::cuda::layout::TableArgument;
 use crate::cuda::network::batched::{Batched, GradientTo, Tiling};
-use crate::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
+use crate::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument};
 use crate::cuda::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
-use ridgewatch_field::{Domain, UnitPoint};
+use ridgewatch_field::UnitPoint;
 use ridgewatch_surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use std::sync::Arc;
 
@@ -370,11 +370,6 @@ pub(super) fn reading(
         further: 0,
         base: table,
     }
-}
-
-/// Lower corner and edge lengths of a domain.
-pub(super) fn unit_box(domain: &Domain) -> UnitBoxArgument {
-    UnitBoxArgument { min: domain.min, extent: domain.extent() }
 }
 
 /// A network that predicts.

@@ -1,7 +1,8 @@
 //! Samples of one network on the device: traced points, their times and targets, in a replay buffer.
 
+use crate::cuda::layout::UnitBoxArgument;
 use crate::cuda::network::layout::ReadingArgument;
-use crate::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s, unit_box};
+use crate::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s};
 use crate::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
 use bytemuck::cast_slice;
 use cudarc::driver::PushKernelArg;
@@ -106,7 +107,7 @@ impl SampleWriter {
             return Ok(());
         }
         assert!(first + count <= to.capacity(), "a buffer of {} for {count} samples from number {first} on", to.capacity());
-        let (domain, shape) = (unit_box(domain), &self.kernels.shape);
+        let (domain, shape) = (UnitBoxArgument::new(domain), &self.kernels.shape);
         let mut times = placed_times(shape, times);
         if further != 0 {
             times[POINT..].fill(f32::NAN);

@@ -4,10 +4,11 @@
 //! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use
 //! half-precision values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.
 
+use crate::cuda::layout::UnitBoxArgument;
 use crate::cuda::network::batched::GradientTo;
 use crate::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
 use crate::cuda::network::network::{
-    DeviceNetwork, LossTerms, NetworkKernels, TangentTerm, copied, copy, further_places, reading, sample_float4s, unit_box,
+    DeviceNetwork, LossTerms, NetworkKernels, TangentTerm, copied, copy, further_places, reading, sample_float4s,
 };
 use crate::cuda::network::samples::{DeviceLabels, DeviceSamples, Filled, SampleWriter, TracedBatch};
 use crate::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
@@ -435,7 +436,7 @@ impl DeviceTraining {
     /// # Errors
     /// Error of the driver.
     pub fn draw_points(&self, domain: &Domain, seed: u64, first: u64, points: &mut Buffer<[f32; 3]>) -> Result<(), DeviceError> {
-        let (domain, n, to) = (unit_box(domain), points.len() as u32, points.address());
+        let (domain, n, to) = (UnitBoxArgument::new(domain), points.len() as u32, points.address());
         let mut call = self.gpu.work().launch_builder(&self.writer.kernels.points);
         call.arg(&domain).arg(&seed).arg(&first).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_points`.

@@ -5,7 +5,7 @@
 
 use crate::audit::{AuditFindings, AuditRequest, draws};
 use crate::cuda::driver::pinned::Pinned;
-use crate::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
+use crate::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs, UnitBoxArgument};
 use crate::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
 use crate::router::unit_jacobian;
 use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
@@ -149,8 +149,7 @@ impl Audits {
             shape: strata.shape.map(|n| n as i32),
             key,
             stream: stream_words,
-            min: domain.min,
-            extent: domain.extent(),
+            domain: UnitBoxArgument::new(domain),
             missing_cells: tracer.missing_cells().map_or_else(bytemuck::Zeroable::zeroed, DeviceMissingCells::argument),
         };
         let points = AuditPointsArgument {

@@ -3,7 +3,7 @@
 use super::march::{BricksArgument, NodeGrid, variant};
 use super::router::DeviceLogStretch;
 use crate::TracedBricks;
-use crate::cuda::network::UnitBoxArgument;
+use crate::cuda::layout::UnitBoxArgument;
 use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use ridgewatch_base::progress;
@@ -137,7 +137,7 @@ impl DeviceBricks {
             .collect();
         let batch = Batch { list: self.gpu.upload(WHAT, &list)?, values: self.gpu.alloc(WHAT, count)? };
         let (points, by) = (self.gpu.alloc::<[f32; 3]>(WHAT, count)?, self.gpu.alloc::<u8>(WHAT, count)?);
-        let (argument, unit_box) = (nodes.argument(), UnitBoxArgument { min: domain.min, extent: domain.extent() });
+        let (argument, unit_box) = (nodes.argument(), UnitBoxArgument::new(domain));
         let (from, to) = (batch.list.address(), points.address());
         let mut call = self.gpu.work().launch_builder(&self.points);
         call.arg(&argument).arg(&unit_box).arg(&from).arg(&to);

@@ -6,7 +6,7 @@
 
 use crate::cuda::driver::pinned::Pinned;
 use crate::cuda::driver_error;
-use crate::cuda::layout::{ChoiceArgument, ListsArgument, Outputs};
+use crate::cuda::layout::{ChoiceArgument, ListsArgument, Outputs, UnitBoxArgument};
 use crate::cuda::rendering::labels::{HELD_BACK, Labels};
 use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, PushKernelArg, result};
@@ -197,8 +197,7 @@ impl DeviceQueryRouter {
         let trusted: Vec<u8> = queries.gate.cells().iter().map(|&trusted| u8::from(trusted)).collect();
         let trusted = queries.surrogate.map(|_| gpu.upload("a gate", &trusted)).transpose()?;
         let choice = ChoiceArgument {
-            min: queries.domain.min,
-            extent: queries.domain.extent(),
+            domain: UnitBoxArgument::new(queries.domain),
             gate_shape: queries.gate.shape().map(|n| n as i32),
             gate_pad: 0,
             trusted: trusted.as_ref().map_or(0, Buffer::address),

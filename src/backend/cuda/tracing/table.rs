@@ -2,7 +2,7 @@
 //!
 //! The seeds are generated brick by brick (8^3 or 8^2 nodes), so that neighbouring threads trace neighbouring seeds.
 
-use crate::cuda::layout::{Outputs, TableArgument, TableFrame};
+use crate::cuda::layout::{Outputs, TableArgument, TableFrame, UnitBoxArgument};
 use crate::cuda::tracing::sort::Sorter;
 use crate::cuda::tracing::trace::DeviceTracer;
 use crate::cuda::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
@@ -83,7 +83,7 @@ impl DeviceTable {
         let kernel = |name| gpu.kernel("table.cu", &[], name);
         Ok(Self {
             gpu: gpu.clone(),
-            frame: TableFrame { nodes: nodes.map(|n| n as i32), dimensions: dimensions as i32, min: domain.min, extent: domain.extent() },
+            frame: TableFrame { nodes: nodes.map(|n| n as i32), dimensions: dimensions as i32, domain: UnitBoxArgument::new(domain) },
             values: gpu.alloc("a table", all)?,
             traced: 0,
             not_finite: 0,
