@@ -45,6 +45,8 @@ mod render;
 mod scenes;
 #[path = "gpu/steering.rs"]
 mod steering;
+#[path = "gpu/sums.rs"]
+mod sums;
 #[path = "gpu/table.rs"]
 mod table;
 #[path = "gpu/trace.rs"]

@@ -90,7 +90,7 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MISSING", "1"), ("EVEN", "3")]),
         ],
-        "march.cu" => [(0, 0), (1, 0), (0, 1), (1, 1)]
+        "march.cu" | "mend.cu" => [(0, 0), (1, 0), (0, 1), (1, 1)]
             .map(|(holes, point_light)| vec![format!("RW_HOLES={holes}"), format!("RW_POINT_LIGHT={point_light}")])
             .into(),
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),

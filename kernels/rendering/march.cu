@@ -47,19 +47,11 @@ march_pixels(const __grid_constant__ FrameScene scene, const __grid_constant__ M
     march_pixel(scene, march, row * scene.width + column, sums, fresh != 0);
 }
 
-// A ray that is marched apart from the picture (see `check_ray`).
-struct Check {
-    uint32_t pixel;
-    uint32_t ray;
-    float step;
-    float shadow_step;
-};
-
 // A block a check. found: radiance and opacity of each check.
 extern "C" __global__ void __launch_bounds__(1024)
 march_checks(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, const Check* __restrict__ checks,
              float* __restrict__ found) {
     __shared__ float memory[CHECK_MEMORY];
     const Check check = checks[blockIdx.x];
-    check_ray(Block{}, scene, march, check.pixel, check.ray, check.step, check.shadow_step, found + 4 * blockIdx.x, memory);
+    check_ray(Block{}, scene, march, check.pixel, check.ray, check.step, check.shadow_step, NO_DRAW, found + 4 * blockIdx.x, memory);
 }

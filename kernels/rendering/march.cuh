@@ -333,22 +333,43 @@ RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w
     }
 }
 
-// Optical depth from a point (grid coordinates) to the light, by the midpoint rule.
-RW_FN float depth_to_light(const FrameScene& scene, const March& march, const float (&point)[3], float step) {
+// Quadrature from a point (grid coordinates) to the light, by the midpoint rule.
+struct ShadowRay {
+    float point[3], direction[3];  // grid coordinates
+    float part;                    // distance between its points, scene units
+    int count;
+};
+
+RW_FN ShadowRay shadow_ray(const FrameScene& scene, const float (&point)[3], float step) {
     double from[3], toward[3], distance;
-    float radiance[3], direction[3], at[3], unit[3];
+    float radiance[3];
+    ShadowRay ray;
     scene_point(scene.box, point, from);
     light_seen_from(scene.light, from, toward, distance, radiance);
-    grid_direction(scene.box, toward, direction);
-    const float length = min_(exit_length(scene.box, point, direction), float(distance));
-    const float count = min_(max_(ceilf(length / step), 1.0f), MOST_POINTS), part = length / count;
-    float sum = 0.0f;
-    for (int i = 0; i < int(count); ++i) {
-        for (int k = 0; k < 3; ++k) at[k] = point[k] + (float(i) + 0.5f) * part * direction[k];
+    grid_direction(scene.box, toward, ray.direction);
+    for (int k = 0; k < 3; ++k) ray.point[k] = point[k];
+    const float length = min_(exit_length(scene.box, point, ray.direction), float(distance));
+    const float count = min_(max_(ceilf(length / step), 1.0f), MOST_POINTS);
+    ray.part = length / count;
+    ray.count = int(count);
+    return ray;
+}
+
+// Sum of the extinction at every `stride`-th point, from the `first`-th on.
+RW_FN float extinction_along(const FrameScene& scene, const March& march, const ShadowRay& ray, int first, int stride) {
+    float sum = 0.0f, at[3], unit[3];
+    for (int i = first; i < ray.count; i += stride) {
+        for (int k = 0; k < 3; ++k) at[k] = ray.point[k] + (float(i) + 0.5f) * ray.part * ray.direction[k];
         unit_of_grid(scene.box, at, unit);
         sum += extinction_at(scene, march, unit);
     }
-    return sum * part;
+    return sum;
+}
+
+// Optical depth from a point (grid coordinates) to the light.
+RW_FN float depth_to_light(const FrameScene& scene, const March& march, const float (&point)[3], float step) {
+    const ShadowRay ray = shadow_ray(scene, point, step);
+    return extinction_along(scene, march, ray, 0, 1) * ray.part;
 }
 
 // The depth at node `index` of a point light's grid.
@@ -510,20 +531,30 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
     add_behind(scene, transmittance, in_missing, i, sum);
 }
 
+// A ray that is marched apart from the picture (see `check_ray`).
+struct Check {
+    uint32_t pixel;
+    uint32_t ray;
+    float step;
+    float shadow_step;
+};
+
 constexpr int CHECK_POINTS = 1024;
-constexpr int CHECK_MEMORY = 4 * CHECK_POINTS + 3;
+constexpr int CHECK_MEMORY = 4 * CHECK_POINTS + 4;
+constexpr float NO_DRAW = -1.0f;
 
 // Radiance and opacity of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light
-// marched with steps of `shadow_step`, or from the light volume if that is 0.
+// marched with steps of `shadow_step`, or from the light volume if that is 0. With a `draw` in [0, 1) it is from the light volume, and what marching finds
+// more is added at the point where the opacity in front passes `draw`, with the weight of a path that scatters there.
 RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, float step,
-                     float shadow_step, float* found, float* memory) {
+                     float shadow_step, float draw, float* found, float* memory) {
     float* absorbed = memory;                         // negative in missing cells
     float* scattered = memory + CHECK_POINTS;         // three planes
-    float* state = memory + 4 * CHECK_POINTS;         // transmittance, missing points, points
+    float* state = memory + 4 * CHECK_POINTS;         // transmittance, missing points, points, the point that is drawn
     Ray ray;
     const bool hit = begin_ray(scene, march.shifted != 0, pixel, number, step, ray);
     block.each(1, [&](int) {
-        state[0] = 1.0f, state[1] = state[2] = 0.0f;
+        state[0] = 1.0f, state[1] = state[2] = 0.0f, state[3] = NO_DRAW;
         for (int k = 0; k < 3; ++k) found[k] = hit ? 0.0f : scene.background[k];
         found[3] = 0.0f;
     });
@@ -541,7 +572,7 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
             absorbed[i] = known ? 1.0f - expf(-sigma * ray.step) : -1.0f;
             if (sigma > 0.0f) {
                 float depth, plane, column[2], grid[3], arriving[3];
-                if (shadow_step > 0.0f) {
+                if (shadow_step > 0.0f && draw == NO_DRAW) {
                     for (int k = 0; k < 3; ++k) grid[k] = ray.origin[k] + t * ray.direction[k];
                     depth = depth_to_light(scene, march, grid, shadow_step);
                 } else {
@@ -562,6 +593,7 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
                     continue;
                 }
                 const float weight = transmittance * absorbed[i];
+                if (found[3] <= draw && draw < found[3] + weight) state[3] = float(first + i);
                 for (int k = 0; k < 3; ++k) found[k] += weight * scattered[k * CHECK_POINTS + i];
                 found[3] += weight;
                 transmittance *= 1.0f - absorbed[i];
@@ -569,11 +601,60 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
             state[0] = transmittance;
         });
     }
+    if (state[3] >= 0.0f) {
+        const float t = (state[3] + ray.offset) * ray.step;
+        float at[3], grid[3];
+        for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
+        for (int k = 0; k < 3; ++k) grid[k] = ray.origin[k] + t * ray.direction[k];
+        const ShadowRay shadow = shadow_ray(scene, grid, shadow_step);
+        const int parts = min_(shadow.count, CHECK_POINTS);
+        block.each(parts, [&](int i) { absorbed[i] = extinction_along(scene, march, shadow, i, parts); });
+        block.each(1, [&](int) {
+            float depth = 0.0f, plane, column[2], ftle, arriving[3];
+            for (int i = 0; i < parts; ++i) depth += absorbed[i];
+            light_place(march.light, at, plane, column);
+            ftle_at(scene, march, at, ftle);
+            light_along(scene, ray, t, arriving);
+            RaySum sum = {{found[0], found[1], found[2]}, 0.0f, 0.0f, 0.0f};
+            add_light(scene, ftle, arriving, ISOTROPIC * (expf(-depth * shadow.part) - expf(-light_depth(march.light, plane, column))), sum);
+            for (int k = 0; k < 3; ++k) found[k] = sum.radiance[k];
+        });
+    }
     block.each(1, [&](int) {
         RaySum sum = {{found[0], found[1], found[2]}, 0.0f, 0.0f, 0.0f};
         add_behind(scene, state[0], int(state[1]), int(state[2]), sum);
         for (int k = 0; k < 3; ++k) found[k] = sum.radiance[k];
     });
+}
+
+// The share of the rays whose steps are halved once, and that of those which are halved again; the largest number of halvings.
+constexpr float HALVED = 0.25f, HALVED_AGAIN = 0.3535534f;
+constexpr int MOST_HALVINGS = 8;
+// Ray as it is, the same with finer steps, and their weighted differences, behind the memory of a check.
+constexpr int MEND_MEMORY = CHECK_MEMORY + 11;
+
+// Two random numbers of a ray: how often its steps are halved, and the opacity at which the light is checked. No path draws in this dimension.
+RW_FN void mend_draws(const FrameScene& scene, uint32_t pixel, uint32_t number, float (&drawn)[2]) {
+    const Words random = words(scene.random, pixel, number, 0xFFFFFFFCu);
+    for (int k = 0; k < 2; ++k) drawn[k] = unit(random.w[k]);
+}
+
+// What makes ray `number` of a pixel, with steps of at most `step`, an unbiased estimate (`Medium::mended_ray`), with all threads of a block: the ray as it
+// is to the first four values of `memory` behind CHECK_MEMORY, and what is to be added to its radiance to the last three.
+RW_FN void mend_ray(const Block& block, const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, float step, float* memory) {
+    float *coarse = memory + CHECK_MEMORY, *fine = coarse + 4, *added = fine + 4, drawn[2];
+    mend_draws(scene, pixel, number, drawn);
+    check_ray(block, scene, march, pixel, number, step, 0.0f, NO_DRAW, coarse, memory);
+    block.each(3, [&](int k) { added[k] = 0.0f, fine[k] = coarse[k]; });
+    float share = HALVED;
+    for (int halvings = 0; halvings < MOST_HALVINGS && drawn[0] < share; ++halvings) {
+        // Before the finer ray takes the place of the last one.
+        block.each(3, [&](int k) { added[k] -= fine[k] / share; });
+        step *= 0.5f;
+        check_ray(block, scene, march, pixel, number, step, step, drawn[1], fine, memory);
+        block.each(3, [&](int k) { added[k] += fine[k] / share; });
+        share *= HALVED_AGAIN;
+    }
 }
 
 // Adds this pass's rays of a pixel to its sums: RAY_FIELDS planes of `pixels` values. `fresh`: the sums begin with this pass.

@@ -123,7 +123,7 @@ impl ProjectionChoice {
 pub enum Combine {
     /// Shrunk: the smallest error. Biased by what it takes for noise; the bias vanishes as samples come.
     Shrink,
-    /// As it is: noisier, and unbiased on the CPU. On a GPU unbiased up to the error of marching.
+    /// As it is: noisier, and unbiased.
     Sum,
 }
 

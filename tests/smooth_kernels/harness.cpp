@@ -102,6 +102,14 @@ int main(int, char** arguments) {
             march.rays = take_one<uint32_t>();
             for (uint32_t pixel = 0; pixel < pixels; ++pixel) march_pixel(marched.scene, march, pixel, sums.data(), pass == 0);
         }
+        // As mend_pixels does.
+        std::vector<float> memory(MEND_MEMORY, NAN);
+        for (uint32_t pixel = 0; march.shifted && pixel < pixels; ++pixel) {
+            for (uint32_t ray = 0; ray < march.first_ray + march.rays; ++ray) {
+                mend_ray(Block{}, marched.scene, march, pixel, ray, march.step, memory.data());
+                for (int k = 0; k < 3; ++k) sums[k * pixels + pixel] += double(memory[MEND_MEMORY - 3 + k]);
+            }
+        }
         give(sums);
     } else if (request == "depths") {
         // Depths to the light at unit points: from the table, and marched with a given step.
@@ -127,7 +135,7 @@ int main(int, char** arguments) {
         for (int i = 0; i < n; ++i) {
             const auto which = take<uint32_t>(2);
             const auto steps = take<float>(2);
-            check_ray(Block{}, marched.scene, marched.march, which[0], which[1], steps[0], steps[1], &found[4 * i], memory.data());
+            check_ray(Block{}, marched.scene, marched.march, which[0], which[1], steps[0], steps[1], NO_DRAW, &found[4 * i], memory.data());
         }
         give(found);
     } else if (request == "combine") {

@@ -21,6 +21,8 @@ pub struct TilePairs {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Allocation {
     cursors: Vec<u8>,
+    /// Pairs so far, or as many as give every pixel one.
+    given: Vec<u16>,
     /// Variance of a single sample.
     variance: Vec<f64>,
 }
@@ -47,7 +49,7 @@ impl Allocation {
     /// No samples yet, for a film of this size.
     pub fn new(width: usize, height: usize) -> Self {
         let count = tiles(width, height).iter().product();
-        Self { cursors: vec![0; count], variance: vec![0.0; count] }
+        Self { cursors: vec![0; count], given: vec![0; count], variance: vec![0.0; count] }
     }
 
     /// Pairs of each tile in the next round, rows of tiles from the top.
@@ -65,7 +67,15 @@ impl Allocation {
             round.push(TilePairs { cursor: *cursor, pairs });
             *cursor = cursor.wrapping_add(pairs as u8);
         }
+        for (given, tile) in self.given.iter_mut().zip(&round) {
+            *given = (usize::from(*given) + tile.pairs).min(TILE_PIXELS) as u16;
+        }
         round
+    }
+
+    /// True once every pixel has had a pair.
+    pub fn covers_every_pixel(&self) -> bool {
+        self.given.iter().all(|given| usize::from(*given) == TILE_PIXELS)
     }
 
     /// Takes in the variance of a single sample in each tile; `None` where it is unknown.

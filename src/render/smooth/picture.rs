@@ -345,7 +345,7 @@ impl Picture {
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let march = self.march.error();
         // A pixel without pairs shows the march of the surrogate.
-        let unbiased = how == Correction::Summed && self.sums.iter().all(|sums| sums.pairs() > 0);
+        let unbiased = how == Correction::Summed && self.allocation.covers_every_pixel();
         let error = PictureError { unbiased, ..PictureError::of(&tiles, &self.march.errors(), steps, samples_per_pixel, self.march.rays) };
         let (of_tiles, across) = (errors_of_tiles(&tiles), width.div_ceil(TILE));
         let of_pixel = |(i, colour): (usize, &[f32; 4])| {

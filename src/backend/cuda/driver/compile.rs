@@ -27,6 +27,7 @@ pub const SOURCES: &[(&str, &str)] = kernel_files![
     "rendering/coupled.cu",
     "rendering/combine.cu",
     "rendering/march.cu",
+    "rendering/mend.cu",
     "rendering/render.cu",
     "tracing/sort.cu",
     "tracing/table.cu",

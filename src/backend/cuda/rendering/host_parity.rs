@@ -80,7 +80,7 @@ struct Case {
     light: LightSettings,
     orthographic: bool,
     holes: bool,
-    shifted: bool,
+    mended: bool,
     /// Limit on the values of the light volume.
     values: usize,
 }
@@ -115,16 +115,20 @@ fn cases() -> Vec<Case> {
         light,
         orthographic: false,
         holes: false,
-        shifted: false,
+        mended: false,
         values: 1 << 20,
     };
     vec![
         case("along -x", from([-1.0, -0.3, -0.2])),
-        Case { shifted: true, ..case("along +y", from([0.2, 1.0, -0.7])) },
+        Case { mended: true, ..case("along +y", from([0.2, 1.0, -0.7])) },
         Case { orthographic: true, ..case("along -z", from([-0.1, 0.4, -1.0])) },
         Case { values: 3000, ..case("coarse, straight along +z", from([0.0, 0.0, 1.0])) },
         Case { holes: true, ..case("holes", from([-1.0, -1.0, -1.0])) },
         case("point", LightSettings { direction: None, position: Some([0.8, 2.0, 0.7]), radiance: [8.0, 9.0, 10.0] }),
+        Case {
+            mended: true,
+            ..case("mended, point", LightSettings { direction: None, position: Some([0.8, 2.0, 0.7]), radiance: [8.0, 9.0, 10.0] })
+        },
         case("point inside", LightSettings { direction: None, position: Some([1.3, 0.4, -0.6]), radiance: [1.0; 3] }),
         Case { domain: flat.clone(), shape: [33, 18, 1], orthographic: true, ..case("flat", from([-1.0, -1.0, -1.0])) },
         Case { domain: flat, shape: [33, 18, 1], holes: true, ..case("flat with holes", from([-0.2, 0.3, -1.0])) },
@@ -171,6 +175,14 @@ impl Case {
         let grid = renderer.light_grid(self.shape, self.values, refine);
         input.extend(bytes(&[LightArgument::new(&grid, 0)]));
         input
+    }
+
+    /// A ray of the picture.
+    fn ray(&self, medium: &Medium<'_>, pixel: u32, number: u64, step: f32, volume: &LightVolume) -> RaySum {
+        match self.mended {
+            true => medium.mended_ray(pixel, number, step, volume),
+            false => medium.ray(pixel, number, step, ToLight::Volume(volume), false),
+        }
     }
 
     fn with<R>(&self, f: impl FnOnce(&mut Renderer, &Nodes, &dyn Fn(&Renderer, &mut dyn FnMut(&Medium<'_>))) -> R) -> R {
@@ -226,7 +238,7 @@ fn rays_agree() {
             let mut input = case.input(renderer, nodes, 1);
             let grid = renderer.light_grid(case.shape, case.values, 1);
             input.extend(bytes(&[step]));
-            input.extend(bytes(&[i32::from(case.shifted)]));
+            input.extend(bytes(&[i32::from(case.mended)]));
             input.extend(bytes(&passes));
             let output = ask("march", &input);
             let mut output = &output[..];
@@ -242,7 +254,7 @@ fn rays_agree() {
                 let (mut lit, mut missing) = (0, 0);
                 for pixel in 0..pixels {
                     let mut sum = RaySum::default();
-                    (0..5).for_each(|j| sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(&volume), case.shifted)));
+                    (0..5).for_each(|j| sum.add(&case.ray(medium, pixel as u32, j, step, &volume)));
                     let [r, g, b] = sum.radiance;
                     for (k, expected) in [r, g, b, sum.alpha, sum.ftle, sum.missing].into_iter().enumerate() {
                         let found = sums[k * pixels + pixel];
@@ -278,7 +290,7 @@ fn checked_rays_agree() {
             // By the light volume and by marching to the light.
             let checks: Vec<(u32, u32, f32, f32)> =
                 (0..40).map(|i| (i * 20 + 7, ray_number(i), 0.02 + 0.001 * i as f32, if i % 2 == 0 { 0.0 } else { 0.03 })).collect();
-            input.extend(bytes(&[i32::from(case.shifted), checks.len() as i32]));
+            input.extend(bytes(&[i32::from(case.mended), checks.len() as i32]));
             for check in &checks {
                 input.extend(bytes(&[check.0, check.1]));
                 input.extend(bytes(&[check.2, check.3]));
@@ -289,7 +301,7 @@ fn checked_rays_agree() {
                 let volume = LightVolume::new(medium, case.values, 1);
                 for (&(pixel, ray, step, shadow), found) in checks.iter().zip(&found) {
                     let light = if shadow > 0.0 { ToLight::March(shadow) } else { ToLight::Volume(&volume) };
-                    let expected = with_alpha(&medium.ray(pixel, u64::from(ray), step, light, case.shifted));
+                    let expected = with_alpha(&medium.ray(pixel, u64::from(ray), step, light, case.mended));
                     let allowed = if case.holes { 2e-2 } else { 3e-4 };
                     let near = (0..4).all(|k| (found[k] - expected[k]).abs() <= allowed * (1.0 + expected[k]));
                     assert!(near, "{}, pixel {pixel}, ray {ray}: {found:?} and {expected:?}", case.name);
@@ -319,13 +331,13 @@ fn a_device_agrees() {
             let grid = laid.grid(Some(&table)).unwrap();
             let medium = DeviceMedium { parameters: &parameters, nodes: grid, missing_cells: None };
             march.prepare(renderer, &medium, case.values, 1).unwrap();
-            march.march(&medium, step, 3, case.shifted).unwrap();
-            march.march(&medium, step, 2, case.shifted).unwrap();
+            march.march(&medium, step, 3, case.mended).unwrap();
+            march.march(&medium, step, 2, case.mended).unwrap();
             assert_eq!(march.rays(), 5);
             let checks: Vec<RayCheck> = (0..40)
                 .map(|i| RayCheck { pixel: i * 20 + 7, ray: ray_number(i), step: 0.02, shadow_step: if i % 2 == 0 { 0.0 } else { 0.03 } })
                 .collect();
-            let checked = march.check(&medium, &checks, case.shifted).unwrap();
+            let checked = march.check(&medium, &checks, case.mended).unwrap();
             // Without pairs the film is the marched picture.
             let pairs = gpu.upload("pairs", &vec![0.0_f32; SUM_PLANES * pixels]).unwrap();
             let input = CombineInput { size: [37, 23], pairs: &pairs, march: &march, how: None, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
@@ -339,7 +351,7 @@ fn a_device_agrees() {
                 let mut apart = 0;
                 for pixel in 0..pixels {
                     let mut sum = RaySum::default();
-                    (0..5).for_each(|j| sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(&volume), case.shifted)));
+                    (0..5).for_each(|j| sum.add(&case.ray(medium, pixel as u32, j, step, &volume)));
                     let [r, g, b] = sum.radiance;
                     for (found, expected) in film.rgba[pixel].iter().zip([r, g, b, sum.alpha]) {
                         apart += u32::from((found - expected / 5.0).abs() > 3e-4 * (1.0 + expected));
@@ -350,7 +362,11 @@ fn a_device_agrees() {
                 assert!(apart as usize <= pixels / 50, "{}: {apart} values of {pixels} pixels apart", case.name);
                 for (check, found) in checks.iter().zip(&checked) {
                     let light = if check.shadow_step > 0.0 { ToLight::March(check.shadow_step) } else { ToLight::Volume(&volume) };
-                    let expected = with_alpha(&medium.ray(check.pixel, u64::from(check.ray), check.step, light, case.shifted));
+                    let number = u64::from(check.ray);
+                    let expected = with_alpha(&match case.mended {
+                        true => medium.mended_ray(check.pixel, number, check.step, &volume),
+                        false => medium.ray(check.pixel, number, check.step, light, false),
+                    });
                     let near = (0..4).all(|k| (found[k] - expected[k]).abs() <= 3e-4 * (1.0 + expected[k]));
                     assert!(near, "{}, {check:?}: {found:?} and {expected:?}", case.name);
                 }

@@ -30,6 +30,9 @@ const CHECK_BLOCK: u32 = 1024;
 /// Threads of a block if there are at least `MANY_CHECKS`: several blocks share a multiprocessor then, and one composes its ray while others look up.
 const SMALL_CHECK_BLOCK: u32 = 128;
 const MANY_CHECKS: usize = 1024;
+/// Threads of the blocks that mend rays, and blocks for each multiprocessor: several share one, and rays differ in length.
+const MEND_BLOCK: u32 = 128;
+const MEND_BLOCKS_EACH: u32 = 32;
 
 /// `Bricks` of `march.cuh`.
 #[repr(C)]
@@ -103,7 +106,7 @@ struct MarchArgument {
     shifted: i32,
 }
 
-/// A ray that [`GpuMarch::check`] marches apart from the picture (`Check` of `march.cu`).
+/// A ray that [`GpuMarch::check`] marches apart from the picture (`Check` of `march.cuh`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct RayCheck {
@@ -113,7 +116,7 @@ pub struct RayCheck {
     pub ray: u32,
     /// Longest step, scene units.
     pub step: f32,
-    /// Longest step to the light, scene units. 0: the light volume is used.
+    /// Longest step to the light, scene units. 0: the light volume is used. A mended ray has steps of its own.
     pub shadow_step: f32,
 }
 
@@ -281,6 +284,36 @@ impl Kernels {
     }
 }
 
+/// Kernels of `mend.cu` in one variant, with their memory.
+struct Mending {
+    variant: [bool; 2],
+    list: CudaFunction,
+    pixels: CudaFunction,
+    checks: CudaFunction,
+    /// Pixels whose ray is mended.
+    listed: Option<Buffer<u32>>,
+    length: Buffer<u32>,
+}
+
+impl Mending {
+    /// Those of a variant, of which `slot` keeps the ownership. Few pictures need them, so that they are compiled when they do.
+    fn of<'a>(gpu: &Gpu, slot: &'a mut Option<Self>, variant: [bool; 2]) -> Result<&'a mut Self, DeviceError> {
+        *slot = slot.take().filter(|mending| mending.variant == variant);
+        let kernel = |name| gpu.kernel("mend.cu", &self::variant(variant[0], variant[1]), name);
+        match slot {
+            Some(mending) => Ok(mending),
+            none => Ok(none.insert(Self {
+                variant,
+                list: kernel("mend_list")?,
+                pixels: kernel("mend_pixels")?,
+                checks: kernel("mend_checks")?,
+                listed: None,
+                length: gpu.alloc("pixels with mended rays", 1)?,
+            })),
+        }
+    }
+}
+
 /// What is marched through: the same in all calls between two calls of [`GpuMarch::prepare`].
 #[derive(Clone, Copy)]
 pub struct Medium<'a> {
@@ -296,6 +329,7 @@ pub struct Medium<'a> {
 pub struct GpuMarch {
     gpu: Arc<Gpu>,
     kernels: Kernels,
+    mending: Option<Mending>,
     highest: Option<Buffer<f32>>,
     depth: Option<Buffer<f32>>,
     /// `RAY_FIELDS` planes.
@@ -315,7 +349,7 @@ impl GpuMarch {
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernels = Kernels::new(gpu, false, false)?;
         let (highest, depth, sums, checks, checked) = (None, None, None, None, None);
-        Ok(Self { gpu: gpu.clone(), kernels, highest, depth, sums, checks, checked, ready: None, rays: 0, pixels: 0 })
+        Ok(Self { gpu: gpu.clone(), kernels, mending: None, highest, depth, sums, checks, checked, ready: None, rays: 0, pixels: 0 })
     }
 
     /// Computes bricks and light volume, on the work stream. To be called when nodes, missing cells, light, transfer function or `refine` have
@@ -394,12 +428,12 @@ impl GpuMarch {
         self.rays
     }
 
-    /// Marches `rays` more rays of each pixel, on the work stream, in steps of at most `step` scene units. `shifted`: each pixel shifts its rays at
-    /// random, which makes their places unbiased, and follows them to their end.
+    /// Marches `rays` more rays of each pixel, on the work stream, in steps of at most `step` scene units. `mended`: they are unbiased estimates of the
+    /// surrogate's expected picture ([`ridgewatch_render::smooth::Medium::mended_ray`]).
     ///
     /// # Errors
     /// Nothing was prepared, or the device fails or lacks memory.
-    pub fn march(&mut self, medium: &Medium<'_>, step: f32, rays: u32, shifted: bool) -> Result<(), DeviceError> {
+    pub fn march(&mut self, medium: &Medium<'_>, step: f32, rays: u32, mended: bool) -> Result<(), DeviceError> {
         let gpu = self.gpu.clone();
         let pixels = medium.parameters.pixels();
         if self.pixels != pixels {
@@ -409,7 +443,7 @@ impl GpuMarch {
             return Ok(());
         }
         let parameters = ParametersArgument(*medium.parameters);
-        let argument = MarchArgument { step, first_ray: self.rays, rays, shifted: i32::from(shifted), ..self.ready(medium)? };
+        let argument = MarchArgument { step, first_ray: self.rays, rays, shifted: i32::from(mended), ..self.ready(medium)? };
         let sums = room(&gpu, &mut self.sums, "sums over rays", RAY_FIELDS * pixels)?.address();
         let fresh = i32::from(self.rays == 0);
         let [width, height] = medium.parameters.size();
@@ -420,7 +454,32 @@ impl GpuMarch {
         // SAFETY: the arguments of `march_pixels`; `sums` holds `RAY_FIELDS` planes of the pixels, which an earlier call has written unless this one
         // is fresh; `medium` borrows nodes and missing cells.
         unsafe { launch(&mut call, config) }?;
+        if mended {
+            self.mend(&parameters, &argument, sums)?;
+        }
         self.rays += rays;
+        Ok(())
+    }
+
+    /// Mends the rays of a pass, which `sums` hold.
+    fn mend(&mut self, parameters: &ParametersArgument, argument: &MarchArgument, sums: u64) -> Result<(), DeviceError> {
+        let (gpu, pixels) = (&self.gpu, self.pixels as u32);
+        let mending = Mending::of(gpu, &mut self.mending, self.kernels.variant)?;
+        let list = room(gpu, &mut mending.listed, "pixels with mended rays", self.pixels)?.address();
+        let length = mending.length.address();
+        let config =
+            LaunchConfig { grid_dim: (MEND_BLOCKS_EACH * gpu.multiprocessors(), 1, 1), block_dim: (MEND_BLOCK, 1, 1), shared_mem_bytes: 0 };
+        for number in argument.first_ray..argument.first_ray + argument.rays {
+            mending.length.zero_front(1)?;
+            let mut call = gpu.work().launch_builder(&mending.list);
+            call.arg(parameters).arg(&number).arg(&pixels).arg(&length).arg(&list);
+            // SAFETY: the arguments of `mend_list`; the list holds all pixels, each of which is listed at most once.
+            unsafe { launch(&mut call, threads(self.pixels, 256)) }?;
+            let mut call = gpu.work().launch_builder(&mending.pixels);
+            call.arg(parameters).arg(argument).arg(&number).arg(&length).arg(&list).arg(&sums);
+            // SAFETY: the arguments of `mend_pixels`; `sums` holds `RAY_FIELDS` planes of the pixels, which `march_pixels` has written.
+            unsafe { launch(&mut call, config) }?;
+        }
         Ok(())
     }
 
@@ -434,27 +493,30 @@ impl GpuMarch {
         self.pixels
     }
 
-    /// Marches single rays apart from the picture and returns their radiances and opacities. Waits for the result.
+    /// Marches single rays apart from the picture and returns their radiances and opacities. `mended`: as those of [`Self::march`]. Waits for the result.
     ///
     /// # Errors
     /// Nothing was prepared, or the device fails or lacks memory.
-    pub fn check(&mut self, medium: &Medium<'_>, checks: &[RayCheck], shifted: bool) -> Result<Vec<[f32; 4]>, DeviceError> {
+    pub fn check(&mut self, medium: &Medium<'_>, checks: &[RayCheck], mended: bool) -> Result<Vec<[f32; 4]>, DeviceError> {
         if checks.is_empty() {
             return Ok(Vec::new());
         }
         let gpu = self.gpu.clone();
         let parameters = ParametersArgument(*medium.parameters);
-        let argument = MarchArgument { shifted: i32::from(shifted), ..self.ready(medium)? };
+        let argument = MarchArgument { shifted: i32::from(mended), ..self.ready(medium)? };
         let what = "checks of the march";
         let from = room(&gpu, &mut self.checks, what, checks.len())?;
         from.write(checks)?;
         let out = room(&gpu, &mut self.checked, what, 4 * checks.len())?;
         let (given, found) = (from.address(), out.address());
-        let block = if checks.len() < MANY_CHECKS { CHECK_BLOCK } else { SMALL_CHECK_BLOCK };
+        let (kernel, block) = match mended {
+            true => (&Mending::of(&gpu, &mut self.mending, self.kernels.variant)?.checks, MEND_BLOCK),
+            false => (&self.kernels.checks, if checks.len() < MANY_CHECKS { CHECK_BLOCK } else { SMALL_CHECK_BLOCK }),
+        };
         let config = LaunchConfig { grid_dim: (checks.len() as u32, 1, 1), block_dim: (block, 1, 1), shared_mem_bytes: 0 };
-        let mut call = gpu.work().launch_builder(&self.kernels.checks);
+        let mut call = gpu.work().launch_builder(kernel);
         call.arg(&parameters).arg(&argument).arg(&given).arg(&found);
-        // SAFETY: the arguments of `march_checks`; both arrays have an entry for each block.
+        // SAFETY: the arguments of `march_checks` and of `mend_checks`; both arrays have an entry for each block.
         unsafe { launch(&mut call, config) }?;
         let mut found = vec![0.0; 4 * checks.len()];
         out.read(&mut found)?;

@@ -78,7 +78,7 @@ pub(super) struct SmoothRound<'a> {
 }
 
 impl SmoothRound<'_> {
-    /// Returns true for the sum: its rays are shifted and its samples spread evenly, as on the CPU.
+    /// Returns true for the sum: its rays are mended and its samples spread evenly, as on the CPU.
     fn is_sum(&self) -> bool {
         self.smooth.sum && self.smooth.method == Method::TwoLevel
     }
@@ -203,7 +203,12 @@ impl GpuSmooth {
             let shows_march = film.shows == self.marches;
             let early = (!self.control.is_due()).then_some((&mut film, shows_march));
             let tiles = self.combine.combine(&input, early)?;
-            let error = PictureError::of(tiles, &self.control.errors(), &round.smooth.steps_error, samples_per_pixel, self.control.rays);
+            let unbiased = round.is_sum() && self.allocation.covers_every_pixel();
+            let of_steps = &round.smooth.steps_error;
+            let error = PictureError {
+                unbiased,
+                ..PictureError::of(tiles, &self.control.errors(), of_steps, samples_per_pixel, self.control.rays)
+            };
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
@@ -250,15 +255,16 @@ impl GpuSmooth {
             rays.map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
         };
         let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
-        // Pixels of earlier audits get the new rays, those of this one all rays and two nets.
+        // Pixels of earlier audits get the new rays, those of this one all rays and two nets. What steps and light volume err, mended rays scatter.
+        let (mended, pair) = (round.is_sum(), if round.is_sum() { 0 } else { PAIR });
         let [first_net, second_net] = self.control.nets();
         let of_audit = [0..now, first_net..second_net + NET];
         let followed = self.control.audited_mut().iter().flat_map(|audited| rays(audited.pixel, before..now, step, 0.0));
         let mut checks: Vec<RayCheck> = followed.collect();
         let [of_followed, each] = [checks.len(), (now + 2 * NET) as usize];
         checks.extend(pixels.iter().flat_map(|&pixel| of_audit.clone().into_iter().flat_map(move |those| rays(pixel, those, step, 0.0))));
-        checks.extend(pixels.iter().flat_map(|&pixel| rays(pixel, 0..PAIR, fine, 0.0)));
-        let found = self.march.check(&medium, &checks, round.is_sum())?;
+        checks.extend(pixels.iter().flat_map(|&pixel| rays(pixel, 0..pair, fine, 0.0)));
+        let found = self.march.check(&medium, &checks, mended)?;
         fn mean<const N: usize>(rays: &[[f32; 4]]) -> [f64; N] {
             std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
         }
@@ -270,19 +276,24 @@ impl GpuSmooth {
                 (0..4).for_each(|k| audited.shown[k] += (new[k] - audited.shown[k]) * due as f64 / now as f64);
             }
         }
-        let (net, pair) = (NET as usize, PAIR as usize);
-        let look = |((&pixel, coarse), fine): ((&u32, &[[f32; 4]]), &[[f32; 4]])| {
+        let (net, pair) = (NET as usize, pair as usize);
+        let look = |(number, (&pixel, coarse)): (usize, (&u32, &[[f32; 4]]))| {
             let (shown, nets) = coarse.split_at(now as usize);
             let nets = [mean(&nets[..net]), mean(&nets[net..])];
-            AuditedPixel { pixel, shown: mean(shown), nets, pair: mean(&shown[..pair]), fine: mean(fine), lit: None }
+            let found = AuditedPixel { pixel, shown: mean(shown), nets, ..AuditedPixel::default() };
+            match mended {
+                true => found,
+                false => AuditedPixel { pair: mean(&shown[..pair]), fine: mean(&finer[number * pair..][..pair]), ..found },
+            }
         };
-        let mut compared: Vec<AuditedPixel> =
-            pixels.iter().zip(coarse.chunks_exact(each)).zip(finer.chunks_exact(pair)).map(look).collect();
-        let mut lit: Vec<&mut AuditedPixel> = compared.iter_mut().filter(|audited| audited.is_lit()).take(LIT_BY_MARCH).collect();
-        let checks: Vec<RayCheck> = lit.iter().flat_map(|audited| rays(audited.pixel, 0..PAIR, fine, to_light)).collect();
-        let found = self.march.check(&medium, &checks, round.is_sum())?;
-        for (audited, rays) in lit.iter_mut().zip(found.chunks_exact(pair)) {
-            audited.lit = Some(mean(rays));
+        let mut compared: Vec<AuditedPixel> = pixels.iter().zip(coarse.chunks_exact(each)).enumerate().map(look).collect();
+        if !mended {
+            let mut lit: Vec<&mut AuditedPixel> = compared.iter_mut().filter(|audited| audited.is_lit()).take(LIT_BY_MARCH).collect();
+            let checks: Vec<RayCheck> = lit.iter().flat_map(|audited| rays(audited.pixel, 0..PAIR, fine, to_light)).collect();
+            let found = self.march.check(&medium, &checks, false)?;
+            for (audited, rays) in lit.iter_mut().zip(found.chunks_exact(pair)) {
+                audited.lit = Some(mean(rays));
+            }
         }
         self.control.audit(compared, ToneMap::new(renderer.scene().settings.tone_map));
         self.shows = shows;
