@@ -14,7 +14,7 @@ use super::report::{Event, RunOptions, RunReport, ShownSlide, Sink};
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{LOOK_UP, Slide, Slides};
-use super::state::{FramePlace, Run, RunGiven};
+use super::state::{FramePlace, Run, RunGiven, Soon};
 use super::steps::{Comparison, PictureSteps, fixed_steps};
 use super::stop::{RunEnd, check_stop};
 use super::storage::begin_with_half;
@@ -59,6 +59,8 @@ pub(super) struct Cycle<'a, B: Backend> {
 
 /// Frames of a slide from which on the first one is drawn soon, with few samples.
 const SOON_FROM: usize = 8;
+/// Stated PSNR of a first frame of few samples below which the second one draws the rest of them and traces no nodes, which takes longer.
+const NOISY: f64 = 32.0;
 
 /// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame, which setting `options.abandon` ends
 /// early. Between frames (while the window fills, tables are traced, or cells are probed) the run ends within about a second.
@@ -311,6 +313,8 @@ impl<B: Backend> Cycle<'_, B> {
         let planned = warmups + time.frames_per_slide;
         let (mut number, mut since_command) = (0, None);
         let (mut pace, mut refining) = (Pace::default(), Refining::default());
+        // Whether the first frame had few samples, and is noisy.
+        let mut is_noisy = false;
         loop {
             // The next window may never come, so this one's next frame tells of a loss.
             slide.warnings.extend(slides.loss());
@@ -351,7 +355,7 @@ impl<B: Backend> Cycle<'_, B> {
             }
             slide.waited += std::mem::take(&mut self.run.progress.waited);
             let preparing = if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 };
-            let mut place = FramePlace { is_warmup: number < warmups, preparing, refining: 0.0, after: None };
+            let mut place = FramePlace { is_warmup: number < warmups, preparing, refining: 0.0, soon: None };
             if self.run.learning.resize.is_some() {
                 transaction!(self, slide, run, on => run.rebuild_surrogate(on));
                 self.run.resized();
@@ -378,12 +382,22 @@ impl<B: Backend> Cycle<'_, B> {
                     None => self.frames_before,
                 };
                 let is_soon = since_command.is_none() && expected >= SOON_FROM && self.run.render.budget.is_none();
-                place.after = is_soon.then_some(shown);
                 if shown == 1 {
                     self.measure_steps(slide)?;
                 }
                 let is_only_slide = slide.index == 0 && slides.is_over();
-                place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
+                let is_put_off = is_noisy && is_soon && shown == 1;
+                if !is_put_off {
+                    // Nodes that were put off by a frame pay as they did before it.
+                    let left = left.map(|left| left + usize::from(is_noisy && is_soon && shown == 2));
+                    place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
+                }
+                place.soon = is_soon.then_some(match shown {
+                    0 => Soon::March,
+                    1 => Soon::Rest,
+                    2 if !(is_noisy && place.refining > 0.0) => Soon::Twice,
+                    _ => Soon::Usual,
+                });
             }
             transaction!(self, slide, run, on => run.learn_shorter(on, slide));
             let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
@@ -392,6 +406,11 @@ impl<B: Backend> Cycle<'_, B> {
             let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
             let is_done = target.is_some_and(is_good) && number >= warmups;
             pace.add(self.run.render.method, &frame.record);
+            if place.soon == Some(Soon::March) && self.run.refines() {
+                let render = &self.run.render;
+                let has_few = render.method == Method::TwoLevel && frame.record.samples_per_pixel < render.samples;
+                is_noisy = has_few && frame.record.picture_error.is_some_and(|error| error.psnr.value < NOISY);
+            }
             let missed = target.zip(frame.record.picture_error).filter(|_| number >= warmups && !is_done);
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));

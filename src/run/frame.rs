@@ -282,7 +282,7 @@ impl Run<'_> {
             None => self.progress.affordable_samples(&self.render, &picture.place),
         };
         // A first frame that is drawn soon gets the nodes of the others.
-        let nodes_for = picture.place.after.map_or(samples_per_pixel, |_| self.render.samples);
+        let nodes_for = picture.place.soon.map_or(samples_per_pixel, |_| self.render.samples);
         let smooth = self.smooth(backend, surrogate.as_ref(), method, nodes_for)?;
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);

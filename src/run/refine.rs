@@ -36,6 +36,8 @@ struct NodesPerFrame {
     worth: f64,
     /// As many as take as long as its samples.
     as_long: f64,
+    /// As many as a frame traces if that completes a table that is not begun.
+    most: f64,
 }
 
 impl Frames {
@@ -55,6 +57,7 @@ impl Frames {
             (false, _) => 0,
             (true, 0) if self.left == Some(1) && !is_too_long => usize::MAX,
             (true, 0) => 0,
+            (true, _) if nodes <= per_frame.most => usize::MAX,
             (true, _) => (per_frame.worth as usize).max(1),
         }
     }
@@ -74,7 +77,7 @@ struct Refined {
 
 impl Run<'_> {
     /// Whether tables are refined: those of smooth pictures whose nodes the scene leaves open.
-    fn refines(&self) -> bool {
+    pub(super) fn refines(&self) -> bool {
         let settings = &self.plan.scene.surrogate;
         let is_open = settings.refine && settings.table_nodes.is_none() && self.learning.sizing.is_none();
         is_open && settings.kind == Kind::Table && self.render.method.is_smooth() && !self.progress.lacks_room_for_nodes
@@ -84,12 +87,13 @@ impl Run<'_> {
         let RenderSettings { width, height, samples, method, budget, .. } = self.render;
         if let Some(milliseconds) = budget {
             let nodes = self.progress.cost.map_or(0.0, |cost| cost.nodes(1e-3 * milliseconds));
-            return NodesPerFrame { worth: nodes, as_long: nodes };
+            return NodesPerFrame { worth: nodes, as_long: nodes, most: nodes };
         }
         // The samples of `marched` only measure its error.
         let samples = if method == Method::Marched { 1.0 } else { samples };
         let [worth, as_long] = backend.nodes_per_sample().map(|nodes| (width * height * nodes) as f64 * samples);
-        NodesPerFrame { worth, as_long }
+        // Two frames' nodes in one: the samples of the first would be lost when the second completes the table.
+        NodesPerFrame { worth, as_long, most: 2.0 * worth }
     }
 
     /// Traces part of a finer table, if frames enough will show it.
@@ -155,7 +159,7 @@ impl<B: Backend> Cycle<'_, B> {
 mod tests {
     use super::*;
 
-    const FEW: NodesPerFrame = NodesPerFrame { worth: 100.0, as_long: 50.0 };
+    const FEW: NodesPerFrame = NodesPerFrame { worth: 100.0, as_long: 50.0, most: 200.0 };
 
     fn left(shown: usize, left: usize) -> Frames {
         Frames { shown, left: Some(left), before: 0, is_only_slide: true }
@@ -165,6 +169,7 @@ mod tests {
     fn a_finer_table_pays_if_tracing_it_takes_half_of_the_frames_at_most() {
         assert_eq!(left(1, 9).part(500, FEW), 0);
         assert_eq!(left(1, 10).part(500, FEW), 100);
+        assert_eq!([200, 201].map(|nodes| left(1, 10).part(nodes, FEW)), [usize::MAX, 100], "the nodes of two frames come at once");
         assert_eq!(left(0, 10).part(500, FEW), 0, "the first picture comes soon");
         assert_eq!(left(0, 1).part(50, FEW), usize::MAX, "a picture of many samples begins with the finer table");
         assert_eq!(left(0, 1).part(51, FEW), 0);

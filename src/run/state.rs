@@ -143,18 +143,18 @@ impl RunProgress {
     }
 
     /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows, of which a part may have gone to a
-    /// finer table. The first frame of many is the march, with the samples that measure its error, and the next two make up for it.
+    /// finer table. The first frame of many is the march, with the samples that measure its error, and later ones make up for it ([`Soon`]).
     pub(super) fn affordable_samples(&self, settings: &RenderSettings, place: &FramePlace) -> f64 {
         /// Samples a pixel of the first frame with a budget, whose cost is not known.
         const FIRST: f64 = 0.25;
         /// Those that measure the error of a march.
         const SOON: f64 = 2.0 * AUDIT_PAIRS;
         let Some(milliseconds) = settings.budget else {
-            return match place.after.filter(|_| settings.method == Method::TwoLevel && settings.samples > SOON) {
-                Some(0) => SOON,
-                Some(1) => settings.samples - SOON,
+            return match place.soon.filter(|_| settings.method == Method::TwoLevel && settings.samples > SOON) {
+                Some(Soon::March) => SOON,
+                Some(Soon::Rest) => settings.samples - SOON,
                 // A target is met by as many as it needs.
-                Some(2) if settings.until.is_none() => 2.0 * settings.samples,
+                Some(Soon::Twice) if settings.until.is_none() => 2.0 * settings.samples,
                 _ => settings.samples,
             };
         };
@@ -176,6 +176,19 @@ impl Recovering for Run<'_> {
     }
 }
 
+/// A frame of a slide whose first one is drawn soon.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Soon {
+    /// The first: the march, with the samples that measure its error.
+    March,
+    /// The second: the rest of the samples of one frame.
+    Rest,
+    /// One that makes up for both.
+    Twice,
+    /// A later one.
+    Usual,
+}
+
 /// Place of a frame in its slide.
 #[derive(Clone, Copy)]
 pub(super) struct FramePlace {
@@ -184,8 +197,8 @@ pub(super) struct FramePlace {
     pub(super) preparing: f64,
     /// Seconds of tracing nodes of a finer table before the frame.
     pub(super) refining: f64,
-    /// Frames that its slide has had, if enough are expected for the first to be drawn soon; `None` with a budget or after a command.
-    pub(super) after: Option<usize>,
+    /// `None` with a budget, after a command, or if too few frames are expected.
+    pub(super) soon: Option<Soon>,
 }
 
 /// What a run is given before its first slide.

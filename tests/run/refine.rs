@@ -27,17 +27,20 @@ fn replay(folder: &Path, name: &str, keys: &[&str]) -> (Vec<FrameRecord>, Vec<[S
 #[test]
 fn a_picture_that_stands_still_starts_anew_on_a_finer_table() {
     let folder = tempfile::tempdir().unwrap();
-    let (open, nodes) = replay(folder.path(), "open", &[]);
-    // 47 x 23 x 23 nodes are the work of 1.5 frames of 32 x 16 pixels with two samples, 16 nodes for each: frames 1 and 2.
-    let samples: Vec<f64> = open.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
-    // The first of eight frames has an eighth of a sample, the second what is missing, and the third the samples of two.
-    assert_eq!(samples, [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0].repeat(2), "each window begins with the nodes of the data");
-    assert!(open.iter().step_by(8).all(|record| record.samples_per_pixel == 0.125));
-    let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 0.0).collect();
-    assert_eq!(refined, [false, true, true, false, false, false, false, false].repeat(2));
-    assert_eq!(nodes.len(), 1);
-    assert_eq!(nodes[0][0], "[47, 23, 23]");
-    assert!(nodes[0][1].contains("[24, 12, 12]") && nodes[0][1].contains("after 2 frames of slide 1"), "{nodes:?}");
+    // 47 x 23 x 23 nodes are the work of 1.5 frames of 32 x 16 pixels with two samples, 16 nodes for each, and come at once. The first of eight frames has an
+    // eighth of a sample, the second what is missing, and the third the samples of two. Where the first is noisy, the second is completed before.
+    let (clear, noisy) = ([0.0, 2.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0], [0.0, 2.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0]);
+    for (name, keys, at, expected) in [("clear", &["transfer.extinction=0.1"][..], 1, clear), ("noisy", &[], 2, noisy)] {
+        let (open, nodes) = replay(folder.path(), name, keys);
+        let samples: Vec<f64> = open.iter().map(|record| record.picture_error.unwrap().samples_per_pixel.round()).collect();
+        assert_eq!(samples, expected.repeat(2), "{name}: each window begins with the nodes of the data");
+        assert!(open.iter().step_by(8).all(|record| record.samples_per_pixel == 0.125));
+        assert!(open.iter().step_by(8).all(|record| (record.picture_error.unwrap().psnr.value < 32.0) == (name == "noisy")));
+        let refined: Vec<bool> = open.iter().map(|record| record.seconds.refine > 0.0).collect();
+        assert_eq!(refined, (0..8).map(|frame| frame == at).collect::<Vec<_>>().repeat(2), "{name}");
+        assert_eq!((nodes.len(), nodes[0][0].as_str()), (1, "[47, 23, 23]"));
+        assert!(nodes[0][1].contains("[24, 12, 12]") && nodes[0][1].contains(&format!("after {at} frames of slide 1")), "{nodes:?}");
+    }
     for keys in [&["surrogate.refine=false"][..], &["surrogate.table_nodes=[24, 12, 12]"], &["time.frames_per_slide=4"]] {
         let (kept, _) = replay(folder.path(), &format!("kept {}", keys[0].len()), keys);
         let first = kept.iter().filter(|record| record.slide == 0);
