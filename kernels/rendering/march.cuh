@@ -611,9 +611,9 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
         block.each(parts, [&](int i) { absorbed[i] = extinction_along(scene, march, shadow, i, parts); });
         block.each(1, [&](int) {
             float depth = 0.0f, plane, column[2], ftle, arriving[3];
+            if (!ftle_at(scene, march, at, ftle)) return;
             for (int i = 0; i < parts; ++i) depth += absorbed[i];
             light_place(march.light, at, plane, column);
-            ftle_at(scene, march, at, ftle);
             light_along(scene, ray, t, arriving);
             RaySum sum = {{found[0], found[1], found[2]}, 0.0f, 0.0f, 0.0f};
             add_light(scene, ftle, arriving, ISOTROPIC * (expf(-depth * shadow.part) - expf(-light_depth(march.light, plane, column))), sum);

@@ -57,7 +57,7 @@ impl Domain {
         [low, high]
     }
 
-    /// Converts unit coordinates in [0, 1] to domain coordinates, which lie in the closed box: rounding never leads out of it.
+    /// Converts unit coordinates in [0, 1] to domain coordinates, which lie in the closed box if any number of single precision does: rounding does not lead out of it.
     pub fn from_unit(&self, unit: UnitPoint) -> DomainPoint {
         let (extent, [low, high]) = (self.extent(), self.inward_corners());
         DomainPoint(std::array::from_fn(|k| ((self.min[k] + extent[k] * f64::from(unit.0[k])) as f32).max(low[k]).min(high[k])))
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn points_of_the_unit_cube_lie_inside() {
-        // Corners that single precision rounds either way, and one whose edge is shorter than a step of it.
+        // Corners that single precision rounds either way, and an edge of a few of its steps.
         for (low, high) in [
             ([0.7, -0.1, 1e-3], [1.7, 0.3, 0.9]),
             ([-1.7, 100.1, -0.3], [-0.7, 200.3, 1.1]),

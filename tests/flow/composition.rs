@@ -61,7 +61,7 @@ fn what_starts_on_an_edge_starts_inside() {
     let unit: Vec<UnitPoint> = (0..40).map(|i| UnitPoint([i as f32 / 100.0, 0.5, 0.5])).collect();
     let worst = composed_in_a_box(&source, &map, [33, 129, 1], &unit, &vec![a * tau; unit.len()]);
     assert!(worst.iter().all(|&worst| worst < 0.05), "{worst:?}");
-    // Nodes of tables, too, of which the outermost lie on all four edges; those above and below leave at once.
+    // Nodes of tables, too, along the same line.
     let table = Table::trace(&cpu_tracer(source, &map, 0.0).unwrap(), [33, 129, 1]).unwrap();
     let middle = &table.values()[64 * 33..][..33];
     assert!(middle.iter().take(26).all(|value| (f64::from(*value) - a * tau).abs() < 1e-3), "{middle:?}");

@@ -129,6 +129,7 @@ fn cases() -> Vec<Case> {
             mended: true,
             ..case("mended, point", LightSettings { direction: None, position: Some([0.8, 2.0, 0.7]), radiance: [8.0, 9.0, 10.0] })
         },
+        Case { mended: true, holes: true, ..case("mended, holes", from([-0.2, 0.3, -1.0])) },
         case("point inside", LightSettings { direction: None, position: Some([1.3, 0.4, -0.6]), radiance: [1.0; 3] }),
         Case { domain: flat.clone(), shape: [33, 18, 1], orthographic: true, ..case("flat", from([-1.0, -1.0, -1.0])) },
         Case { domain: flat, shape: [33, 18, 1], holes: true, ..case("flat with holes", from([-0.2, 0.3, -1.0])) },

@@ -116,7 +116,7 @@ pub struct RayCheck {
     pub ray: u32,
     /// Longest step, scene units.
     pub step: f32,
-    /// Longest step to the light, scene units. 0: the light volume is used. A mended ray has steps of its own.
+    /// Longest step to the light, scene units. 0: the light volume is used. Ignored for mended rays.
     pub shadow_step: f32,
 }
 

@@ -308,7 +308,9 @@ impl GpuSmooth {
         answers: &mut dyn DeviceLogStretch,
     ) -> Result<RenderStats, DeviceError> {
         let pairs_per_pixel = if round.smooth.method == Method::Marched { AUDIT_PAIRS } else { round.samples / 2.0 };
-        let plan = self.allocation.next(pairs_per_pixel);
+        // Counts once the samples are there.
+        let mut allocation = self.allocation.clone();
+        let plan = allocation.next(pairs_per_pixel);
         let grid = node_grid(&self.nodes, round)?;
         let argument = grid.argument();
         let nodes = SurrogateNodes { values: argument.values, shape: grid.shape(), dimensions: argument.dimensions as usize };
@@ -338,9 +340,10 @@ impl GpuSmooth {
             stats.evaluate_seconds += found.answer_seconds;
             stats.stopped |= found.stopped;
             if stats.stopped {
-                break;
+                return Ok(stats);
             }
         }
+        self.allocation = allocation;
         Ok(stats)
     }
 }
