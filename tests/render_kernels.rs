@@ -431,7 +431,11 @@ fn the_same_one_answers_at_every_point() {
         let mut random = uniform(8);
         let mut points: Vec<DomainPoint> = (0..20_000).map(|_| domain.from_unit(UnitPoint([random(), random(), random()]))).collect();
         // Outside the domain, corners, and nodes of the velocity grid themselves.
-        points.extend((0..5000).map(|_| domain.from_unit(UnitPoint([(); 3].map(|()| 1.8 * random() - 0.4)))));
+        let outside: Vec<DomainPoint> = (0..5000)
+            .map(|_| DomainPoint(std::array::from_fn(|k| ((1.8 * random() - 0.4) * domain.extent()[k] as f32) + domain.min[k] as f32)))
+            .collect();
+        assert!(outside.iter().filter(|point| !domain.contains(**point)).count() > 2500);
+        points.extend(outside);
         points.extend([[0.0; 3], [2.0, 1.0, 1.0]].map(DomainPoint));
         let nodes = axes(periodic);
         points.extend((0..77).map(|i| DomainPoint([nodes[0][i % 11] as f32, nodes[1][i % 6] as f32, nodes[2][i % 7] as f32])));

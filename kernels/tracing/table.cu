@@ -9,6 +9,7 @@ struct TableFrame {
     int dimensions;
     UnitBox domain;
 };
+static_assert(sizeof(TableFrame) == 88, "layout");
 
 // Seeds at the nodes, {x, y, z, node index}. Bricks of 8x8x8 nodes (8x8 in the plane), each in
 // Morton order, keep neighbours together without a sort. Nodes beyond the table get the index 0xffffffff. `first`: number of the first seed in

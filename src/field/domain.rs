@@ -57,10 +57,16 @@ impl Domain {
         [low, high]
     }
 
-    /// Converts unit coordinates in [0, 1] to domain coordinates, which lie in the closed box if any number of single precision does: rounding does not lead out of it.
+    /// Domain coordinates in single precision. Rounding does not lead out of the closed box if any number of single precision lies in it.
+    pub fn inward(&self, point: [f64; 3]) -> DomainPoint {
+        let [low, high] = self.inward_corners();
+        DomainPoint(std::array::from_fn(|k| (point[k] as f32).max(low[k]).min(high[k])))
+    }
+
+    /// Converts unit coordinates in [0, 1] to domain coordinates, which lie in the box (see [`Self::inward`]).
     pub fn from_unit(&self, unit: UnitPoint) -> DomainPoint {
-        let (extent, [low, high]) = (self.extent(), self.inward_corners());
-        DomainPoint(std::array::from_fn(|k| ((self.min[k] + extent[k] * f64::from(unit.0[k])) as f32).max(low[k]).min(high[k])))
+        let extent = self.extent();
+        self.inward(std::array::from_fn(|k| self.min[k] + extent[k] * f64::from(unit.0[k])))
     }
 
     /// Converts domain coordinates to unit coordinates, clamped to [0, 1].

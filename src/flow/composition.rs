@@ -196,8 +196,7 @@ impl Composition {
 
     /// The seed of a node, in single precision and not outside of the domain.
     fn seed(&self, node: usize) -> DomainPoint {
-        let (at, [low, high]) = (self.coordinates(node), self.domain.inward_corners());
-        DomainPoint(std::array::from_fn(|axis| (at[axis] as f32).max(low[axis]).min(high[axis])))
+        self.domain.inward(self.coordinates(node))
     }
 
     /// State at domain coordinates.

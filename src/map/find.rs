@@ -221,7 +221,7 @@ fn volume(
     let mut values = Vec::with_capacity(nodes);
     for first in (0..nodes).step_by(AT_ONCE) {
         let seeds: Vec<DomainPoint> = (first..(first + AT_ONCE).min(nodes))
-            .map(|node| DomainPoint([at(0, node % nx), at(1, node / nx % ny), at(2, node / (nx * ny))].map(|c| c as f32)))
+            .map(|node| domain.inward([at(0, node % nx), at(1, node / nx % ny), at(2, node / (nx * ny))]))
             .collect();
         values.extend(tracer.ftle(&seeds, done).map_err(RunError::of)?);
     }

@@ -17,6 +17,8 @@ pub struct View {
     pub is_geographic: bool,
     /// Third coordinate of all seeds.
     pub level: f64,
+    /// That of the data.
+    domain: Domain,
     /// Left and upper end of the raster in the plane.
     corner: [f64; 2],
     /// Edge of a pixel in the plane.
@@ -59,7 +61,7 @@ impl View {
         }
         let pixel = longer / pixels as f64;
         let size = extent.map(|e| ((e / pixel).round() as usize).max(1));
-        Ok(Self { projection, size, region, is_geographic, level, corner: [low[0], high[1]], pixel })
+        Ok(Self { projection, size, region, is_geographic, level, domain: domain.clone(), corner: [low[0], high[1]], pixel })
     }
 
     /// Coordinates of a place in pixels, from the upper left corner. `None` outside of the data.
@@ -79,9 +81,9 @@ impl View {
         [east - west, north - south]
     }
 
-    /// A seed at coordinates of the map.
+    /// A seed at coordinates of the map, not outside of the data.
     pub fn seed(&self, [x, y]: [f64; 2]) -> DomainPoint {
-        DomainPoint([x as f32, y as f32, self.level as f32])
+        self.domain.inward([x, y, self.level])
     }
 
     /// The rim of the data, in pixels: a closed line, or circles of latitude where a polar map closes.
@@ -94,5 +96,23 @@ impl View {
             return [south, north].into_iter().filter(|latitude| latitude.abs() < 90.0).map(circle).collect();
         }
         vec![lines(&whole)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seeds_on_an_edge_lie_inside() {
+        // Corners that single precision rounds outwards.
+        let domain = Domain::cuboid([0.7, 0.1, -1.7], [1.7, 1.1, -0.7]);
+        for level in [-1.7, -0.7] {
+            let view = View::new(&domain, false, None, level, 64).unwrap();
+            let [west, south, east, north] = view.region;
+            for place in [[west, south], [east, north]] {
+                assert!(domain.contains(view.seed(place)), "{place:?} at {level}: {:?}", view.seed(place));
+            }
+        }
     }
 }

@@ -123,7 +123,7 @@ impl ProjectionChoice {
 pub enum Combine {
     /// Shrunk: the smallest error. Biased by what it takes for noise; the bias vanishes as samples come.
     Shrink,
-    /// As it is: noisier, and unbiased.
+    /// As it is: noisier, and unbiased (on a GPU but for what half precision loses of the field).
     Sum,
 }
 

@@ -388,9 +388,8 @@ impl<B: Backend> Cycle<'_, B> {
                 let is_only_slide = slide.index == 0 && slides.is_over();
                 let is_put_off = is_noisy && is_soon && shown == 1;
                 if !is_put_off {
-                    // Nodes that were put off by a frame pay as they did before it.
-                    let left = left.map(|left| left + usize::from(is_noisy && is_soon && shown == 2));
-                    place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide })?;
+                    let put_off = usize::from(is_noisy && is_soon && shown == 2);
+                    place.refining = self.refine(slide, Frames { shown, left, before: self.frames_before, is_only_slide, put_off })?;
                 }
                 place.soon = is_soon.then_some(match shown {
                     0 => Soon::March,

@@ -27,6 +27,8 @@ pub(super) struct Frames {
     pub(super) before: usize,
     /// True if the run has no other slide.
     pub(super) is_only_slide: bool,
+    /// Frames by which nodes were put off: they pay as they did before.
+    pub(super) put_off: usize,
 }
 
 /// Nodes of a finer table for a frame.
@@ -43,7 +45,8 @@ struct NodesPerFrame {
 impl Frames {
     /// Frames that are expected to come: those that are left, or else as many as were shown, or how many more the slide before had.
     fn expected(self) -> usize {
-        self.left.unwrap_or(self.shown.max(self.before.saturating_sub(self.shown)))
+        let shown = self.shown - self.put_off;
+        self.left.map_or(shown.max(self.before.saturating_sub(shown)), |left| left + self.put_off)
     }
 
     /// Nodes to trace before the next frame for a table of `nodes` in all; 0 if it does not pay. It does if tracing takes at most half of the frames that are
@@ -162,7 +165,7 @@ mod tests {
     const FEW: NodesPerFrame = NodesPerFrame { worth: 100.0, as_long: 50.0, most: 200.0 };
 
     fn left(shown: usize, left: usize) -> Frames {
-        Frames { shown, left: Some(left), before: 0, is_only_slide: true }
+        Frames { shown, left: Some(left), before: 0, is_only_slide: true, put_off: 0 }
     }
 
     #[test]
@@ -170,6 +173,7 @@ mod tests {
         assert_eq!(left(1, 9).part(500, FEW), 0);
         assert_eq!(left(1, 10).part(500, FEW), 100);
         assert_eq!([200, 201].map(|nodes| left(1, 10).part(nodes, FEW)), [usize::MAX, 100], "the nodes of two frames come at once");
+        assert_eq!(Frames { put_off: 1, ..left(2, 9) }.part(500, FEW), 100, "as with one frame fewer");
         assert_eq!(left(0, 10).part(500, FEW), 0, "the first picture comes soon");
         assert_eq!(left(0, 1).part(50, FEW), usize::MAX, "a picture of many samples begins with the finer table");
         assert_eq!(left(0, 1).part(51, FEW), 0);
@@ -183,7 +187,7 @@ mod tests {
 
     #[test]
     fn without_an_end_a_picture_is_expected_to_stand_as_long_as_it_stood() {
-        let open = |shown, before| Frames { shown, left: None, before, is_only_slide: false };
+        let open = |shown, before| Frames { shown, left: None, before, is_only_slide: false, put_off: 0 };
         assert_eq!(open(9, 0).part(500, FEW), 0);
         assert_eq!(open(10, 0).part(500, FEW), 100);
         assert_eq!(open(1, 11).part(500, FEW), 100, "the slide before had eleven frames");

@@ -72,7 +72,7 @@ pub struct PictureError {
     /// Root mean square of the error of the Runge-Kutta steps alone, linear radiance. It is part of the errors above; 0 where it was not measured.
     #[serde(default)]
     pub steps_rms: f64,
-    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"`. The FTLE of a map is unbiased.
+    /// True if the mean of such pictures over seeds is that of the traced field: `combine = "sum"`, on a GPU but for what half precision loses. The FTLE of a map is unbiased.
     pub unbiased: bool,
     /// Coupled samples per pixel since the picture started anew.
     pub samples_per_pixel: f64,
