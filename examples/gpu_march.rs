@@ -59,7 +59,7 @@ fn main() {
     let mut combine = GpuCombine::new(&gpu).unwrap();
 
     println!("{width}x{height} pixels, {shape:?} nodes on a {}; milliseconds of device time.\n", gpu.name());
-    println!("| light | preparation | step, cells | 1 ray | 4 rays | 48 checks |");
+    println!("| light | preparation | step, cells | 2 rays | 4 rays | 48 checks |");
     println!("|---|---|---|---|---|---|");
     let corner = std::array::from_fn(|k| domain.max[k] + 0.5 * domain.extent()[k]);
     for (name, light, values) in [
@@ -76,7 +76,7 @@ fn main() {
         let spacing = renderer.node_spacing(shape) as f32;
         let preparation = median(&gpu, || march.prepare(&renderer, &medium, values, 1));
         for cells in [1.0, 0.5] {
-            let rays = [1, 4].map(|rays| {
+            let rays = [2, 4].map(|rays| {
                 median(&gpu, || {
                     march.restart();
                     march.march(&medium, cells * spacing, rays, false)

@@ -38,13 +38,23 @@ march_points(const __grid_constant__ FrameScene scene, const __grid_constant__ M
     if (i < n) fill_node(scene, march, i);
 }
 
-// Blocks of 16 x 16 pixels, warps of 8 x 4. `fresh`: 1 on the first pass since the restart.
+// `lanes` threads a pixel, 1, 2 or 4, which march its rays in turn: rays of a pixel part less than those of others, so that the threads of a warp do the
+// same for longer. Warps of 4 x (8 / lanes) pixels, blocks of 16 x (16 / lanes). `fresh`: 1 on the first pass since the restart.
 extern "C" __global__ void __launch_bounds__(256, 4)
-march_pixels(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, double* __restrict__ sums, int fresh) {
-    const uint32_t lane = threadIdx.x & 31u, warp = threadIdx.x / 32u;
-    const uint32_t column = blockIdx.x * 16u + (warp % 2u) * 8u + lane % 8u, row = blockIdx.y * 16u + (warp / 2u) * 4u + lane / 8u;
+march_pixels(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, double* __restrict__ sums, int fresh, uint32_t lanes) {
+    const uint32_t lane = threadIdx.x % lanes, place = (threadIdx.x & 31u) / lanes, warp = threadIdx.x / 32u, tall = 8u / lanes;
+    const uint32_t column = blockIdx.x * 16u + (warp % 4u) * 4u + place % 4u, row = (blockIdx.y * 2u + warp / 4u) * tall + place / 4u;
+    // The threads of a pixel stay or leave together.
     if (column >= scene.width || row >= scene.height) return;
-    march_pixel(scene, march, row * scene.width + column, sums, fresh != 0);
+    const uint32_t pixel = row * scene.width + column;
+    RaySum sum = march_rays(scene, march, pixel, lane, lanes);
+    const uint32_t together = ((1u << lanes) - 1u) << ((threadIdx.x & 31u) - lane);
+    float* const fields[RAY_FIELDS] = {&sum.radiance[0], &sum.radiance[1], &sum.radiance[2], &sum.alpha, &sum.ftle, &sum.missing};
+    for (uint32_t apart = 1u; apart < lanes; apart *= 2u) {
+        RW_UNROLL
+        for (int k = 0; k < RAY_FIELDS; ++k) *fields[k] += __shfl_xor_sync(together, *fields[k], apart);
+    }
+    if (lane == 0u) add_rays(sum, size_t(scene.width) * scene.height, pixel, sums, fresh != 0);
 }
 
 // A block a check. found: radiance and opacity of each check.

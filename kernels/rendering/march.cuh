@@ -406,14 +406,8 @@ RW_FN float ray_offset(uint32_t ray, int axis, const float random[2]) {
 
 // Colour of the light at a quadrature point, given the weight of the point times the transmittance to the light.
 RW_FN void add_light(const FrameScene& scene, float ftle, const float radiance[3], float scattered, RaySum& sum) {
-    const float t = 1.0f - ramp(scene.transfer, ftle);
-    const int* own = scene.transfer.coefficients;
-    float colour[3] = {0.0f, 0.0f, 0.0f};
-    // Coefficients past a channel's own are 0.
-    for (int i = max_(max_(own[0], own[1]), own[2]) - 1; i >= 0; --i) {
-        RW_UNROLL
-        for (int k = 0; k < 3; ++k) colour[k] = colour[k] * t + scene.transfer.albedo[k][i];
-    }
+    float colour[3];
+    albedo(scene.transfer, ftle, colour);
     for (int k = 0; k < 3; ++k) sum.radiance[k] += scattered * colour[k] * radiance[k];
 }
 
@@ -657,11 +651,15 @@ RW_FN void mend_ray(const Block& block, const FrameScene& scene, const March& ma
     }
 }
 
-// Adds this pass's rays of a pixel to its sums: RAY_FIELDS planes of `pixels` values. `fresh`: the sums begin with this pass.
-RW_FN void march_pixel(const FrameScene& scene, const March& march, uint32_t pixel, double* sums, bool fresh) {
+// Sum of this pass's rays of a pixel: of every `stride`-th, from the `first`-th on.
+RW_FN RaySum march_rays(const FrameScene& scene, const March& march, uint32_t pixel, uint32_t first, uint32_t stride) {
     RaySum sum = {{0.0f, 0.0f, 0.0f}, 0.0f, 0.0f, 0.0f};
-    for (uint32_t ray = 0; ray < march.rays; ++ray) march_ray(scene, march, pixel, march.first_ray + ray, sum);
-    const size_t pixels = size_t(scene.width) * scene.height;
+    for (uint32_t ray = first; ray < march.rays; ray += stride) march_ray(scene, march, pixel, march.first_ray + ray, sum);
+    return sum;
+}
+
+// Adds rays of a pixel to its sums: RAY_FIELDS planes of `pixels` values. `fresh`: the sums begin with these.
+RW_FN void add_rays(const RaySum& sum, size_t pixels, uint32_t pixel, double* sums, bool fresh) {
     const float fields[RAY_FIELDS] = {sum.radiance[0], sum.radiance[1], sum.radiance[2], sum.alpha, sum.ftle, sum.missing};
     RW_UNROLL
     for (int k = 0; k < RAY_FIELDS; ++k) {

@@ -19,12 +19,23 @@ RW_FN float ramp(const Transfer& transfer, float ftle) {
 
 RW_FN float extinction(const Transfer& transfer, float ftle) { return transfer.extinction_max * ramp(transfer, ftle); }
 
-RW_FN void albedo(const Transfer& transfer, float ftle, float colour[3]) {
+// Coefficients past a channel's own are 0, so that loops of fixed lengths do: they read constants in place, without an index.
+RW_FN void albedo(const Transfer& transfer, float ftle, float (&colour)[3]) {
     const float t = 1.0f - ramp(transfer, ftle);
-    for (int k = 0; k < 3; ++k) {
-        float sum = 0.0f;
-        for (int i = transfer.coefficients[k] - 1; i >= 0; --i) sum = sum * t + transfer.albedo[k][i];
-        colour[k] = sum;
+    const int* own = transfer.coefficients;
+    const bool is_short = own[0] <= 8 && own[1] <= 8 && own[2] <= 8;
+    for (int k = 0; k < 3; ++k) colour[k] = 0.0f;
+    if (!is_short) {
+        RW_UNROLL
+        for (int i = 15; i >= 8; --i) {
+            RW_UNROLL
+            for (int k = 0; k < 3; ++k) colour[k] = colour[k] * t + transfer.albedo[k][i];
+        }
+    }
+    RW_UNROLL
+    for (int i = 7; i >= 0; --i) {
+        RW_UNROLL
+        for (int k = 0; k < 3; ++k) colour[k] = colour[k] * t + transfer.albedo[k][i];
     }
 }
 

@@ -100,7 +100,7 @@ int main(int, char** arguments) {
         for (int pass = 0; pass < 2; ++pass) {
             march.first_ray = march.rays;
             march.rays = take_one<uint32_t>();
-            for (uint32_t pixel = 0; pixel < pixels; ++pixel) march_pixel(marched.scene, march, pixel, sums.data(), pass == 0);
+            for (uint32_t pixel = 0; pixel < pixels; ++pixel) add_rays(march_rays(marched.scene, march, pixel, 0, 1), pixels, pixel, sums.data(), pass == 0);
         }
         // As mend_pixels does.
         std::vector<float> memory(MEND_MEMORY, NAN);

@@ -23,7 +23,7 @@ pub(in crate::cuda) const RAY_FIELDS: usize = 6;
 const NODES_AT_ONCE: usize = 1 << 20;
 /// Columns of a block of `march_columns`.
 const COLUMN_BLOCK: [usize; 2] = [16, 8];
-/// Edge of a block of `march_pixels`, in pixels.
+/// Width of a block of `march_pixels`, and its height if a pixel has one thread, in pixels.
 const PIXEL_BLOCK: usize = 16;
 /// Threads of a block of `march_checks`.
 const CHECK_BLOCK: u32 = 1024;
@@ -447,10 +447,12 @@ impl GpuMarch {
         let sums = room(&gpu, &mut self.sums, "sums over rays", RAY_FIELDS * pixels)?.address();
         let fresh = i32::from(self.rays == 0);
         let [width, height] = medium.parameters.size();
-        let blocks = |n: usize| n.div_ceil(PIXEL_BLOCK) as u32;
-        let config = LaunchConfig { grid_dim: (blocks(width), blocks(height), 1), block_dim: (256, 1, 1), shared_mem_bytes: 0 };
+        let lanes = [4, 2].into_iter().find(|lanes| rays.is_multiple_of(*lanes)).unwrap_or(1);
+        let blocks = |n: usize, pixels: usize| n.div_ceil(pixels) as u32;
+        let grid_dim = (blocks(width, PIXEL_BLOCK), blocks(height, PIXEL_BLOCK / lanes as usize), 1);
+        let config = LaunchConfig { grid_dim, block_dim: (256, 1, 1), shared_mem_bytes: 0 };
         let mut call = gpu.work().launch_builder(&self.kernels.pixels);
-        call.arg(&parameters).arg(&argument).arg(&sums).arg(&fresh);
+        call.arg(&parameters).arg(&argument).arg(&sums).arg(&fresh).arg(&lanes);
         // SAFETY: the arguments of `march_pixels`; `sums` holds `RAY_FIELDS` planes of the pixels, which an earlier call has written unless this one
         // is fresh; `medium` borrows nodes and missing cells.
         unsafe { launch(&mut call, config) }?;
