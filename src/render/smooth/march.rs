@@ -1,8 +1,9 @@
 //! Marching: the expected picture of the surrogate, by quadrature along camera rays (emission and absorption, Max 1995).
 //!
 //! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through the same points in every pixel, in fours: a point
-//! and its quarter turns around the centre, so that no such number of rays shifts the picture or blurs one direction more than another. The first point is
-//! that of Gauss's rule, the others are those of an additive recurrence in two dimensions, which fills the pixel evenly.
+//! and its quarter turns around the centre, so that no such number of rays shifts the picture or blurs one direction more than another. The first two of
+//! four lie on opposite sides of the centre, so that they do not shift it either. The first point is that of Gauss's rule, the others are those of an
+//! additive recurrence in two dimensions, which fills the pixel evenly.
 
 use super::light_volume::LightVolume;
 use super::march_control::{FIRST_AUDIT_RAY, NET};
@@ -204,13 +205,14 @@ impl Medium<'_> {
 mod tests {
     use super::offsets;
     use crate::rng::{philox, unit};
-    use crate::smooth::{AuditedPixel, FIRST_AUDIT_RAY, MIN_RAYS, MarchControl, NET, ToneMap};
+    use crate::smooth::march_control::QUARTER_TURNS;
+    use crate::smooth::{AuditedPixel, FIRST_AUDIT_RAY, MarchControl, NET, PAIR, ToneMap};
 
-    /// Mean square errors of the picture and what an audit of it states, after 4, 8, 12... rays of a pattern that lies across the pixel. `shown` gives the
-    /// colour at a distance from an edge or ridge.
-    fn stated_and_found(shown: impl Fn(f32) -> f32, angle: f32, most: u64) -> Vec<[f64; 2]> {
+    /// Mean square errors of the picture and what an audit of it states, after each `rays` and up to `most` rays of a pattern that lies across the pixel.
+    /// `shown` gives the colour at a distance from an edge or ridge.
+    fn stated_and_found(shown: impl Fn(f32) -> f32, angle: f32, rays: u64, most: u64) -> Vec<[f64; 2]> {
         const PLACES: usize = 960;
-        let mut audits = vec![Vec::new(); (most / MIN_RAYS) as usize];
+        let mut audits = vec![Vec::new(); (most / rays) as usize];
         let mut found = vec![0.0; audits.len()];
         for place in 0..PLACES {
             let at = -1.2 + 2.4 * (place as f32 + 0.5) / PLACES as f32;
@@ -223,7 +225,7 @@ mod tests {
             };
             let nets = [net(0), net(1)];
             for (number, (audit, square)) in audits.iter_mut().zip(&mut found).enumerate() {
-                let rays = MIN_RAYS * (number as u64 + 1);
+                let rays = rays * (number as u64 + 1);
                 let mean = (0..rays).map(|j| colour(offsets(j, [0.0; 4]))).sum::<f64>() / rays as f64;
                 *square += (mean - truth).powi(2) / PLACES as f64;
                 audit.push(AuditedPixel { shown: [mean, mean, mean, 1.0], nets, ..AuditedPixel::default() });
@@ -241,8 +243,9 @@ mod tests {
     #[test]
     fn edges_of_all_directions_are_audited() {
         for angle in [0.0, 0.02, 0.1, 0.4, 0.785, 1.2, 1.5508, std::f32::consts::FRAC_PI_2] {
-            let [stated, found] = stated_and_found(|distance| f32::from(distance < 0.0), angle, MIN_RAYS)[0];
-            assert!((stated / found - 1.0).abs() < 0.2, "angle {angle}: {stated} stated, {found} found");
+            for [stated, found] in stated_and_found(|distance| f32::from(distance < 0.0), angle, PAIR, QUARTER_TURNS) {
+                assert!((stated / found - 1.0).abs() < 0.2, "angle {angle}: {stated} stated, {found} found");
+            }
         }
     }
 
@@ -256,7 +259,7 @@ mod tests {
             let shown = |distance: f32| if width > 0.0 { (-0.5 * (distance / width).powi(2)).exp() } else { f32::from(distance < 0.0) };
             let mut sums = [[0.0; 2]; 16];
             for angle in 0..ANGLES {
-                let errors = stated_and_found(shown, std::f32::consts::PI * (angle as f32 + 0.3) / ANGLES as f32, 64);
+                let errors = stated_and_found(shown, std::f32::consts::PI * (angle as f32 + 0.3) / ANGLES as f32, QUARTER_TURNS, 64);
                 sums.iter_mut().zip(errors).for_each(|(sum, error)| (0..2).for_each(|k| sum[k] += error[k]));
             }
             assert!(sums.iter().all(|[stated, found]| (stated / found - 1.0).abs() < 0.2), "width {width}: {sums:?}");

@@ -4,10 +4,11 @@ use super::statement::{LIT, MarchError};
 use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
-/// Rays come two by two, on opposite sides of the pixel's centre.
+/// Rays come two by two, on opposite sides of the pixel's centre. The first round has one such pair, whose error is that of the steps where nodes are no
+/// finer than pixels.
 pub const PAIR: u64 = 2;
-/// Rays per pixel of the first round and, at least, of others: two pairs, a quarter turn apart.
-pub const MIN_RAYS: u64 = 4;
+/// Rays through a point and its quarter turns around the centre. Rounds after the first end with whole ones.
+pub(super) const QUARTER_TURNS: u64 = 4;
 /// Most rays per pixel that a picture gets.
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
@@ -143,7 +144,7 @@ impl Default for MarchControl {
         let [filter, steps, light, both, unlit] = [Mean::default(); 5];
         Self {
             rays: 0,
-            next_rays: MIN_RAYS,
+            next_rays: PAIR,
             step: FIRST_STEP,
             audits: 0,
             audits_before: 0,
@@ -166,7 +167,7 @@ impl MarchControl {
     /// The control of the same view of other nodes. It gets as many rays at once, so that the picture becomes no coarser than it was, or as many as a
     /// budget has time for.
     pub fn on_other_nodes(&self) -> Self {
-        Self { next_rays: self.rays.clamp(MIN_RAYS, MAX_RAYS), ..self.restarted() }
+        Self { next_rays: self.rays.clamp(PAIR, MAX_RAYS), ..self.restarted() }
     }
 
     /// Divisor of the distances in the light volume.
@@ -256,12 +257,12 @@ impl MarchControl {
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
         let wanted = self.filter.value(0) > SPARE * allowed;
-        self.next_rays = if wanted && self.rays < MAX_RAYS { MIN_RAYS } else { 0 };
+        self.next_rays = if wanted && self.rays < MAX_RAYS { QUARTER_TURNS - self.rays % QUARTER_TURNS } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
         if self.quadrature(0) > allowed && self.step > MIN_STEP {
-            let next_rays = self.rays.max(MIN_RAYS);
+            let next_rays = self.rays.max(PAIR);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
         }
@@ -334,7 +335,7 @@ mod tests {
         };
         // Nothing is asked of the march.
         assert_eq!(rounds(&mut control, 1e6), (MIN_AUDITS, false));
-        control.next_rays = MIN_RAYS;
+        control.next_rays = PAIR;
         assert_eq!(rounds(&mut control, 1e-6), (1, true));
         assert_eq!((control.step, rounds(&mut control, 1e6)), (0.5 * FIRST_STEP, (MIN_AUDITS, false)));
     }

@@ -31,7 +31,7 @@ pub use regression::Guides;
 pub use statement::{ErrorEstimate, MarchError, PictureError, StepsError, TileErrors, TileSums, noise_psnr};
 pub use {
     allocation::{Allocation, TILE},
-    march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR},
+    march_control::{AUDIT_STEPS, AuditedPixel, FIRST_AUDIT_RAY, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR},
     picture::AUDIT_PAIRS,
     statement::{LIT, TileError, error_at, errors_of_tiles},
     tone::{ToneMap, squared_slope},

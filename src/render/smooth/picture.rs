@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{RaySum, ToLight};
-use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, NET, PAIR};
+use super::march_control::{AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MarchControl, Marching, NET, PAIR};
 use super::medium::{IsMissing, Medium};
 use super::nodes::Nodes;
 use super::regression::Guides;
@@ -182,9 +182,8 @@ impl Picture {
     /// As many rays as it had on other nodes, or as many again, may take too long at once.
     fn march_at_most(&mut self, seconds: f64) {
         if let Some(each) = self.ray_seconds {
-            // Rays come in fours.
-            let most = (seconds / each) as u64 / MIN_RAYS * MIN_RAYS;
-            self.march.next_rays = self.march.next_rays.min(most.max(MIN_RAYS));
+            let most = (seconds / each) as u64 / PAIR * PAIR;
+            self.march.next_rays = self.march.next_rays.min(most.max(PAIR));
         }
     }
 
