@@ -43,12 +43,13 @@ pub(super) fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -
         ("network", Kind::Network, own, suited),
         ("network", Kind::Network, own, if is_gpu { frequency } else { narrow }),
     ];
-    // The large ones of both kinds come first, in case that time ends.
+    // The large ones of both kinds come first.
     if let Some(small) = small {
         variants.insert(2, ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()));
         variants.insert(3, ("network", Kind::Network, own, small));
     }
     variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
+    let mut pupils = Vec::new();
     for (name, kind, nodes, network) in variants {
         let size = match network.encoding {
             Encoding::HashGrid => format!("{}x{}, {} entries", network.levels(), network.features, thousands(entries(&network))),
@@ -61,16 +62,20 @@ pub(super) fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -
         }
         let began = Instant::now();
         let settings = SurrogateSettings { kind, table_nodes: Some(nodes), ..SurrogateSettings::default() };
-        let Some(mut surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
-        let built = began.elapsed().as_secs_f64();
-        let mut lessons = Lessons::new(bench.opened);
-        for seconds in TRAINED {
-            if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
-                break;
+        let Some(surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
+        let lessons = Lessons::new(bench.opened);
+        pupils.push(Pupil { name, size, what, surrogate, built: began.elapsed().as_secs_f64(), lessons, ended: false });
+    }
+    // Each has its first figures before any trains for long, in case that time ends.
+    for seconds in TRAINED {
+        for Pupil { name, size, what, surrogate, built, lessons, ended } in pupils.iter_mut().filter(|pupil| !pupil.ended) {
+            *ended = !bench.charting.has_time_for(&format!("{what}, {seconds} s of training"));
+            if *ended {
+                continue;
             }
             let (before, is_late) = (lessons.steps, lessons.seconds >= seconds);
             while lessons.seconds < seconds {
-                bench.charting.pool.install(|| lessons.give(&mut surrogate, &tracer, seconds))?;
+                bench.charting.pool.install(|| lessons.give(surrogate, &tracer, seconds))?;
             }
             if lessons.steps == before {
                 bench.charting.skip(
@@ -80,10 +85,24 @@ pub(super) fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -
                 continue;
             }
             let frozen = surrogate.freeze().map_err(failed)?;
-            bench.measure_predictor(name, format!("{size}, {seconds} s"), built + lessons.seconds, &frozen)?;
+            bench.measure_predictor(name, format!("{size}, {seconds} s"), *built + lessons.seconds, &frozen)?;
         }
     }
     Ok(())
+}
+
+/// A surrogate in training.
+struct Pupil<'a, S> {
+    name: &'static str,
+    size: String,
+    /// Name and size.
+    what: String,
+    surrogate: S,
+    /// Seconds that building it took.
+    built: f64,
+    lessons: Lessons<'a>,
+    /// No time was left for it.
+    ended: bool,
 }
 
 /// A count in thousands or millions.
