@@ -249,7 +249,7 @@ mod tests {
         }
     }
 
-    /// Edges, and ridges of a fraction of a pixel as small pictures have them, in all directions: after any number of rays the stated error is the true one,
+    /// Edges, and ridges of a fraction of a pixel as small pictures have them, in all directions: after any number of fours the stated error is the true one,
     /// and it falls about as that of independent rays or faster.
     #[test]
     fn more_rays_have_a_smaller_error() {

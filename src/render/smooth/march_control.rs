@@ -4,10 +4,9 @@ use super::statement::{LIT, MarchError};
 use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
-/// Rays come two by two, on opposite sides of the pixel's centre. The first round has one such pair, whose error is that of the steps where nodes are no
-/// finer than pixels.
+/// Two rays on opposite sides of the pixel's centre. A picture begins with them: where pixels are no coarser than nodes, steps err more than they do.
 pub const PAIR: u64 = 2;
-/// Rays through a point and its quarter turns around the centre. Rounds after the first end with whole ones.
+/// Rays through a point and its quarter turns around the centre. Beyond the first pair, pictures have whole ones.
 pub(super) const QUARTER_TURNS: u64 = 4;
 /// Most rays per pixel that a picture gets.
 const MAX_RAYS: u64 = 64;
@@ -170,6 +169,13 @@ impl MarchControl {
         Self { next_rays: self.rays.clamp(PAIR, MAX_RAYS), ..self.restarted() }
     }
 
+    /// Leaves rays to later rounds, if there is time for no more than `rays` now.
+    pub fn at_most(&mut self, rays: u64) {
+        let whole = (self.rays + rays) / QUARTER_TURNS * QUARTER_TURNS;
+        let least = if self.rays == 0 { PAIR } else { QUARTER_TURNS - self.rays % QUARTER_TURNS };
+        self.next_rays = self.next_rays.min(whole.saturating_sub(self.rays).max(least));
+    }
+
     /// Divisor of the distances in the light volume.
     pub fn refine(&self) -> usize {
         (FIRST_STEP / self.step).round().max(1.0) as usize
@@ -312,6 +318,34 @@ mod tests {
         let found = control.errors();
         assert!((found.unlit[0] - 0.005).abs() < 1e-6 && found.unlit[1] > 0.0, "{found:?}");
         assert!((found.squared[2] - 0.09).abs() < 1e-6, "{found:?}");
+    }
+
+    /// Beyond the first pair a picture has rays in fours, also if time allows few at once.
+    #[test]
+    fn rays_come_in_quarter_turns() {
+        let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [1.0; 3], nets: [[0.5; 3]; 2], ..AuditedPixel::default() };
+        for (may_go_on, most, expected) in [
+            (false, 64, vec![2, 4, 8, 12, 16]),
+            (true, 64, vec![2, 4, 8, 16, 32, 64]),
+            (true, 6, vec![2, 4, 8, 12, 16]),
+            (true, 0, vec![2, 4, 8, 12, 16]),
+        ] {
+            let mut control = MarchControl::default();
+            let rays: Vec<u64> = (0..expected.len())
+                .map(|_| {
+                    control.at_most(most);
+                    control.rays += control.next_rays;
+                    control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
+                    control.decide(1e-6, may_go_on);
+                    control.rays
+                })
+                .collect();
+            assert_eq!(rays, expected, "{may_go_on}, {most}");
+        }
+        // Other nodes begin with as many, or with a pair.
+        let mut control = MarchControl { rays: 8, ..MarchControl::default() }.on_other_nodes();
+        control.at_most(3);
+        assert_eq!((control.rays, control.next_rays), (0, 2));
     }
 
     /// After steps were halved, the statement rests on as many audits as at first.

@@ -182,8 +182,7 @@ impl Picture {
     /// As many rays as it had on other nodes, or as many again, may take too long at once.
     fn march_at_most(&mut self, seconds: f64) {
         if let Some(each) = self.ray_seconds {
-            let most = (seconds / each) as u64 / PAIR * PAIR;
-            self.march.next_rays = self.march.next_rays.min(most.max(PAIR));
+            self.march.at_most((seconds / each) as u64);
         }
     }
 
