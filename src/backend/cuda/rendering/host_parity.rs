@@ -334,7 +334,8 @@ fn a_device_agrees() {
             march.prepare(renderer, &medium, case.values, 1).unwrap();
             march.march(&medium, step, 3, case.mended).unwrap();
             march.march(&medium, step, 2, case.mended).unwrap();
-            assert_eq!(march.rays(), 5);
+            march.march(&medium, step, 4, case.mended).unwrap();
+            assert_eq!(march.rays(), 9);
             let checks: Vec<RayCheck> = (0..40)
                 .map(|i| RayCheck { pixel: i * 20 + 7, ray: ray_number(i), step: 0.02, shadow_step: if i % 2 == 0 { 0.0 } else { 0.03 } })
                 .collect();
@@ -352,12 +353,12 @@ fn a_device_agrees() {
                 let mut apart = 0;
                 for pixel in 0..pixels {
                     let mut sum = RaySum::default();
-                    (0..5).for_each(|j| sum.add(&case.ray(medium, pixel as u32, j, step, &volume)));
+                    (0..9).for_each(|j| sum.add(&case.ray(medium, pixel as u32, j, step, &volume)));
                     let [r, g, b] = sum.radiance;
                     for (found, expected) in film.rgba[pixel].iter().zip([r, g, b, sum.alpha]) {
-                        apart += u32::from((found - expected / 5.0).abs() > 3e-4 * (1.0 + expected));
+                        apart += u32::from((found - expected / 9.0).abs() > 3e-4 * (1.0 + expected));
                         // Rounding may give a ray one step more or less, which is the error of a step.
-                        assert!((found - expected / 5.0).abs() <= 0.02, "{}, pixel {pixel}: {found} and {}", case.name, expected / 5.0);
+                        assert!((found - expected / 9.0).abs() <= 0.02, "{}, pixel {pixel}: {found} and {}", case.name, expected / 9.0);
                     }
                 }
                 assert!(apart as usize <= pixels / 50, "{}: {apart} values of {pixels} pixels apart", case.name);
