@@ -66,7 +66,7 @@ pub(super) fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -
         let lessons = Lessons::new(bench.opened);
         pupils.push(Pupil { name, size, what, surrogate, built: began.elapsed().as_secs_f64(), lessons, ended: false });
     }
-    // Each has its first figures before any trains for long, in case that time ends.
+    // All have first figures before any is trained for long, in case that time ends.
     for seconds in TRAINED {
         for Pupil { name, size, what, surrogate, built, lessons, ended } in pupils.iter_mut().filter(|pupil| !pupil.ended) {
             *ended = !bench.charting.has_time_for(&format!("{what}, {seconds} s of training"));
