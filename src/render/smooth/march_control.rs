@@ -4,7 +4,7 @@ use super::statement::{LIT, MarchError};
 use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
-/// Two rays on opposite sides of the pixel's centre. A picture begins with them: where pixels are no coarser than nodes, steps err more than they do.
+/// Two rays on opposite sides of the pixel's centre. Pictures of few samples begin with them: where pixels are no coarser than nodes, steps err more.
 pub const PAIR: u64 = 2;
 /// Rays through a point and its quarter turns around the centre. Beyond the first pair, pictures have whole ones.
 pub(super) const QUARTER_TURNS: u64 = 4;
@@ -167,6 +167,13 @@ impl MarchControl {
     /// budget has time for.
     pub fn on_other_nodes(&self) -> Self {
         Self { next_rays: self.rays.clamp(PAIR, MAX_RAYS), ..self.restarted() }
+    }
+
+    /// The first round of a picture has a pair of rays, or its quarter turns too if it has more than one sample a pixel, which take longer than they do.
+    pub fn begin(&mut self, samples: f64) {
+        if self.rays == 0 && samples > 1.0 {
+            self.next_rays = self.next_rays.max(QUARTER_TURNS);
+        }
     }
 
     /// Leaves rays to later rounds, if there is time for no more than `rays` now.
