@@ -176,10 +176,15 @@ impl MarchControl {
         }
     }
 
+    /// Rays up to the next whole quarter turns.
+    fn to_whole_turns(&self) -> u64 {
+        QUARTER_TURNS - self.rays % QUARTER_TURNS
+    }
+
     /// Leaves rays to later rounds, if there is time for no more than `rays` now.
     pub fn at_most(&mut self, rays: u64) {
         let whole = (self.rays + rays) / QUARTER_TURNS * QUARTER_TURNS;
-        let least = if self.rays == 0 { PAIR } else { QUARTER_TURNS - self.rays % QUARTER_TURNS };
+        let least = if self.rays == 0 { PAIR } else { self.to_whole_turns() };
         self.next_rays = self.next_rays.min(whole.saturating_sub(self.rays).max(least));
     }
 
@@ -270,7 +275,7 @@ impl MarchControl {
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
         let wanted = self.filter.value(0) > SPARE * allowed;
-        self.next_rays = if wanted && self.rays < MAX_RAYS { QUARTER_TURNS - self.rays % QUARTER_TURNS } else { 0 };
+        self.next_rays = if wanted && self.rays < MAX_RAYS { self.to_whole_turns() } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
