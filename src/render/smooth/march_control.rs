@@ -4,7 +4,7 @@ use super::statement::{LIT, MarchError};
 use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
-/// Two rays on opposite sides of the pixel's centre. Pictures of few samples begin with them: where pixels are no coarser than nodes, steps err more.
+/// Two rays on opposite sides of the pixel's centre, with which pictures begin: where pixels are no coarser than nodes, steps err more.
 pub const PAIR: u64 = 2;
 /// Rays through a point and its quarter turns around the centre. Beyond the first pair, pictures have whole ones.
 pub(super) const QUARTER_TURNS: u64 = 4;
@@ -169,13 +169,6 @@ impl MarchControl {
         Self { next_rays: self.rays.clamp(PAIR, MAX_RAYS), ..self.restarted() }
     }
 
-    /// The first round of a picture has a pair of rays, or its quarter turns too if it has more than one sample a pixel, which take longer than they do.
-    pub fn begin(&mut self, samples: f64) {
-        if self.rays == 0 && samples > 1.0 {
-            self.next_rays = self.next_rays.max(QUARTER_TURNS);
-        }
-    }
-
     /// Rays up to the next whole quarter turns.
     fn to_whole_turns(&self) -> u64 {
         QUARTER_TURNS - self.rays % QUARTER_TURNS
@@ -279,12 +272,15 @@ impl MarchControl {
         if !may_go_on {
             return Marching::Enough;
         }
-        if self.quadrature(0) > allowed && self.step > MIN_STEP {
+        let more = self.filter.value(0) > allowed && self.rays < MAX_RAYS;
+        let finer = self.quadrature(0) > allowed && self.step > MIN_STEP;
+        // The larger error first, since time may end before both are small.
+        if finer && !(more && self.filter.value(0) > self.quadrature(0)) {
             let next_rays = self.rays.max(PAIR);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
         }
-        if self.filter.value(0) > allowed && self.rays < MAX_RAYS {
+        if more {
             self.next_rays = self.rays.min(MAX_RAYS - self.rays);
             return Marching::More;
         }
@@ -358,6 +354,16 @@ mod tests {
         let mut control = MarchControl { rays: 8, ..MarchControl::default() }.on_other_nodes();
         control.at_most(3);
         assert_eq!((control.rays, control.next_rays), (0, 2));
+    }
+
+    #[test]
+    fn the_larger_error_is_mended_first() {
+        for (net, fine, expected) in [(0.5, 0.9, Marching::More), (0.9, 0.5, Marching::Anew)] {
+            let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [fine; 3], nets: [[net; 3]; 2], ..AuditedPixel::default() };
+            let mut control = MarchControl { rays: PAIR, ..MarchControl::default() };
+            control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
+            assert_eq!(control.decide(1e-6, true), expected, "{net}, {fine}");
+        }
     }
 
     /// After steps were halved, the statement rests on as many audits as at first.

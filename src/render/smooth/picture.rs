@@ -126,7 +126,6 @@ impl Picture {
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
         let tone_map = ToneMap::new(scene.settings.tone_map);
         let mut begins = self.march.rays == 0;
-        self.march.begin(round.samples);
         if let (true, Some(budget)) = (begins, round.budget) {
             self.march_at_most(budget);
         }

@@ -177,7 +177,6 @@ impl GpuSmooth {
         answers: &mut dyn DeviceLogStretch,
     ) -> Result<Option<(Arc<Film>, RenderStats, PictureError)>, DeviceError> {
         self.settle(round, renderer, answers)?;
-        self.control.begin(round.samples);
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
         let sampling = Instant::now();
