@@ -1,9 +1,10 @@
-//! Compiles every kernel for two architectures, in representative variants. Needs NVRTC but no GPU: `make test` fetches NVRTC and runs these
+//! Compiles every kernel in representative variants, and for two architectures. Needs NVRTC but no GPU: `make test` fetches NVRTC and runs these
 //! tests; a plain `cargo test` reports them as ignored.
 
 #![cfg(feature = "cuda")]
 #![allow(clippy::unwrap_used)]
 
+use rayon::prelude::*;
 use ridgewatch::backend::cuda::compile::{Request, SOURCES};
 use ridgewatch::backend::cuda::{LossTerms, Tiling, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings, Target};
@@ -112,14 +113,19 @@ fn variants(source: &str) -> Vec<Vec<String>> {
 #[test]
 #[ignore = "needs NVRTC (`make test` fetches it)"]
 fn for_both_architectures() {
-    for source in SOURCES.iter().filter_map(|(path, _)| path.rsplit('/').next()) {
-        for defines in variants(source) {
-            for capability in [(8, 0), (9, 0)] {
-                let cubin = Request::new(source, capability, &defines).unwrap().compile().unwrap_or_else(|error| panic!("{error}"));
-                assert!(cubin.starts_with(b"\x7fELF"), "{source} {defines:?}: machine code");
-            }
-        }
-    }
+    let sources = SOURCES.iter().filter_map(|(path, _)| path.rsplit('/').next());
+    // The usual variant for both, the others for one or the other.
+    let requests = sources.flat_map(|source| {
+        let of_variant = move |(number, defines): (usize, Vec<String>)| {
+            let capabilities = [(9, 0), (8, 0)].into_iter().enumerate().filter(move |(k, _)| number == 0 || number % 2 == *k);
+            capabilities.map(move |(_, capability)| (source, capability, defines.clone()))
+        };
+        variants(source).into_iter().enumerate().flat_map(of_variant)
+    });
+    requests.par_bridge().for_each(|(source, capability, defines)| {
+        let cubin = Request::new(source, capability, &defines).unwrap().compile().unwrap_or_else(|error| panic!("{error}"));
+        assert!(cubin.starts_with(b"\x7fELF"), "{source} {defines:?}: machine code");
+    });
 }
 
 #[test]
