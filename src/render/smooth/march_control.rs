@@ -265,17 +265,20 @@ impl MarchControl {
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
-    pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
+    /// `has_budget`: the time for rays is limited.
+    pub fn decide(&mut self, others: f64, may_go_on: bool, has_budget: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let wanted = self.filter.value(0) > SPARE * allowed;
+        let (filter, quadrature) = (self.filter.value(0), self.quadrature(0));
+        let wanted = filter > SPARE * allowed;
         self.next_rays = if wanted && self.rays < MAX_RAYS { self.to_whole_turns() } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
-        let more = self.filter.value(0) > allowed && self.rays < MAX_RAYS;
-        let finer = self.quadrature(0) > allowed && self.step > MIN_STEP;
-        // The larger error first, since time may end before both are small.
-        if finer && !(more && self.filter.value(0) > self.quadrature(0)) {
+        let more = filter > allowed && self.rays < MAX_RAYS;
+        let finer = quadrature > allowed && self.step > MIN_STEP;
+        // The larger error first, since time may end before both are small. Finer steps discard all rays, so they come first if a budget may not have the
+        // time for as many again.
+        if finer && (!more || has_budget || quadrature >= filter) {
             let next_rays = self.rays.max(PAIR);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
@@ -344,7 +347,7 @@ mod tests {
                     control.at_most(most);
                     control.rays += control.next_rays;
                     control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
-                    control.decide(1e-6, may_go_on);
+                    control.decide(1e-6, may_go_on, true);
                     control.rays
                 })
                 .collect();
@@ -357,12 +360,22 @@ mod tests {
     }
 
     #[test]
-    fn the_larger_error_is_mended_first() {
-        for (net, fine, expected) in [(0.5, 0.9, Marching::More), (0.9, 0.5, Marching::Anew)] {
+    fn the_larger_error_is_lowered_first() {
+        for (net, fine, rays, step, has_budget, expected) in [
+            (0.5, 0.9, PAIR, FIRST_STEP, false, Marching::More),
+            (0.9, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
+            (0.5, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
+            // Where one of them cannot be lowered, the other is.
+            (0.5, 0.9, MAX_RAYS, FIRST_STEP, false, Marching::Anew),
+            (0.9, 0.5, PAIR, MIN_STEP, false, Marching::More),
+            (0.5, 0.5, MAX_RAYS, MIN_STEP, false, Marching::Enough),
+            // Steps, while few rays are lost.
+            (0.5, 0.9, PAIR, FIRST_STEP, true, Marching::Anew),
+        ] {
             let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [fine; 3], nets: [[net; 3]; 2], ..AuditedPixel::default() };
-            let mut control = MarchControl { rays: PAIR, ..MarchControl::default() };
+            let mut control = MarchControl { rays, step, ..MarchControl::default() };
             control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
-            assert_eq!(control.decide(1e-6, true), expected, "{net}, {fine}");
+            assert_eq!(control.decide(1e-6, true, has_budget), expected, "{net}, {fine}, {rays}, {step}");
         }
     }
 
@@ -379,7 +392,7 @@ mod tests {
                 control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
                 control.rays += control.next_rays;
                 count += 1;
-                if control.decide(others, true) == Marching::Anew {
+                if control.decide(others, true, true) == Marching::Anew {
                     return (count, true);
                 }
             }

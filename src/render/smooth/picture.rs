@@ -156,10 +156,12 @@ impl Picture {
             if round.stop.load(Ordering::Relaxed) {
                 return self.stopped();
             }
-            match self.march.decide(others, marching < allowed) {
+            match self.march.decide(others, marching < allowed, round.budget.is_some()) {
                 Marching::Enough => break (film, error),
                 Marching::Anew => {
                     begins = true;
+                    // Twice as many steps.
+                    self.ray_seconds = self.ray_seconds.map(|seconds| 2.0 * seconds);
                     self.light = None;
                     self.base.fill(RaySum::default());
                 }

@@ -212,7 +212,7 @@ impl GpuSmooth {
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
-            match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
+            match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed, false) {
                 Marching::Enough => break (error, errors_of_tiles(tiles)),
                 Marching::Anew => {
                     // If the preparation fails, the picture starts anew.
