@@ -14,7 +14,7 @@
 #                      a solver find the shared library in PREFIX/lib when it runs
 # make fuzz            runs each fuzz target in tests/fuzz for FUZZ_SECONDS (60); cargo-fuzz goes into target/cargo-fuzz only
 # make deny            checks licences, sources and duplicates of the dependencies against deny.toml; cargo-deny goes into target/cargo-deny only
-# make test-adapters   tests of the adapters that need gfortran, mpicc, Python or root. Missing compilers are installed if apt is available (gfortran, openmpi-bin,
+# make test-adapters   runs the tests of the adapters that need gfortran, mpicc, Python, root or 16 GB. Missing compilers are installed if apt is available (gfortran, openmpi-bin,
 #                      libopenmpi-dev, python3-venv), else named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv only
 # make live-figures    measures the figures of docs/live.md that need no GPU and prints their tables, in some 20 minutes; with SHORT=1 in a few
 #                      minutes, which only show that each measurement runs
@@ -104,7 +104,7 @@ demo: build
 test: packages python-packages
 	@# Serves an archive over HTTPS.
 	@command -v openssl >/dev/null || { $(call install,openssl); }
-	@# Without the examples, which need a fifth of the time to build; `.ci/run` checks that they compile.
+	@# Without the examples; `.ci/run` checks that they compile.
 	$(CARGO) test --release --workspace --tests
 	$(CARGO) test --release --workspace --doc
 	@if $(MAKE) --no-print-directory $(NVRTC)/done; then \
@@ -258,7 +258,7 @@ adapter-packages:
 test-adapters: packages python-packages adapter-packages adapters
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release --workspace --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release --workspace --test messages --test ring --test publish -- --ignored; else \
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release --workspace --test follow --test messages --test mutation --test properties --test ring --test publish -- --ignored --skip gigabytes; else \
 	  echo "NOT RUN: the tests of full file systems and of files of another user, since they need root"; fi
 	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release --workspace --test follow -- --ignored gigabytes; else \
 	  echo "NOT RUN: the relay test with steps of 2 GB, since it needs 16 GB of memory"; fi

@@ -20,15 +20,12 @@ const PAIRS: usize = 50;
 
 /// An archive that ftle.py reads too.
 pub struct Compared<'a> {
-    /// What ftle.py calls it.
-    pub kind: &'a str,
-    pub files: &'a [PathBuf],
-    /// Settings of the archive.
-    pub keys: &'a str,
-    /// Seconds, backward from the last time.
-    pub tau: f64,
+    kind: &'a str,
+    files: &'a [PathBuf],
+    keys: &'a str,
+    tau: f64,
     /// Tasks of ftle.py and its answers.
-    pub asked: RefCell<BTreeMap<String, Vec<serde_json::Value>>>,
+    asked: RefCell<BTreeMap<String, Vec<serde_json::Value>>>,
 }
 
 /// Log-stretches of this program and of ftle.py.
@@ -38,7 +35,12 @@ pub struct Pairs {
     tau: f64,
 }
 
-impl Compared<'_> {
+impl<'a> Compared<'a> {
+    /// An archive that ftle.py calls `kind`, with `keys` as its settings, over `tau` seconds backward from its last time.
+    pub fn new(kind: &'a str, files: &'a [PathBuf], keys: &'a str, tau: f64) -> Self {
+        Self { kind, files, keys, tau, asked: RefCell::default() }
+    }
+
     /// Linear interpolation and steps that err by nothing that counts.
     pub fn exactly(&self) -> Pairs {
         self.with(&FlowMap {
@@ -252,7 +254,7 @@ fn columns_agree_with_an_independent_integration() {
         [("roms", roms(), "", 3600.0), ("layers", layers(), "", 86_400.0), ("hybrid", hybrid(), "", 6.0 * 3600.0)]
     {
         let files = [fixture.write(&dir.path().join(format!("{kind}.nc")))];
-        let compared = Compared { kind, files: &files, keys, tau, asked: RefCell::default() };
+        let compared = Compared::new(kind, &files, keys, tau);
         // The same interpolant: columns at fixed heights, those between linear in all directions.
         let (relative, correlation) = compared.exactly().report(kind);
         assert!(relative < 1e-4 && correlation > 0.999_99, "{kind}: {relative} {correlation}");
@@ -270,7 +272,7 @@ fn columns_agree_with_an_independent_integration() {
             .chain(heights.last().copied())
             .collect();
         let keys = format!("heights = {finer:?}");
-        let compared = Compared { kind: "roms columns", files: &files, keys: &keys, tau: 3600.0, asked: RefCell::default() };
+        let compared = Compared::new("roms columns", &files, &keys, 3600.0);
         errors.push(compared.exactly().report(&format!("roms, {times} times as many heights as levels")).0);
     }
     assert!(errors[1] < errors[0], "{errors:?}");

@@ -261,7 +261,7 @@ fn faces_agree_with_an_independent_integration() {
         0.02 * [a.sin() * b.cos() + 0.4 * c.sin(), 0.7 * (a.cos() - b).sin() + 0.2 * c.cos(), 0.03 * (a + b).sin() * c.cos()][which]
     };
     let files = [staggered(field).write(&dir.path().join("faces.nc"))];
-    let compared = Compared { kind: "rows", files: &files, keys: "", tau: 3600.0, asked: Default::default() };
+    let compared = Compared::new("rows", &files, "", 3600.0);
     let (relative, correlation) = compared.exactly().report("faces");
     // The same interpolant.
     assert!(relative < 1e-6 && correlation > 0.999_999, "{relative} {correlation}");

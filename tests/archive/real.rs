@@ -166,7 +166,7 @@ fn automatic_steps_see_the_kinks_of_linear_interpolation() {
 /// former pairs.
 fn agreeing(kind: &str, files: &Path, tau: f64, [most, least]: [f64; 2]) -> Pairs {
     let files = [files.to_owned()];
-    let compared = Compared { kind, files: &files, keys: "", tau, asked: Default::default() };
+    let compared = Compared::new(kind, &files, "", tau);
     let pairs = compared.exactly();
     let (relative, correlation) = pairs.report(kind);
     assert!(relative < most && correlation > least, "{kind}: {relative} {correlation}");
