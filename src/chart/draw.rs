@@ -2,7 +2,7 @@
 
 use super::Chart;
 use super::ftle::{CHARGED, FtlePanel, FtlePoint};
-use super::picture::{PictureCurve, PicturePanel};
+use super::picture::{PictureCurve, PicturePanel, PicturePoint};
 use super::scaling::{Axis, ScalingPanel};
 use super::verdict::size;
 use crate::source::duration;
@@ -70,7 +70,8 @@ pub type Curve = (String, Vec<(f64, f64)>);
 /// # Errors
 /// plotters fails.
 pub fn write_epochs(title: &str, curves: &[Curve]) -> Result<String, DrawError> {
-    let series = curves.iter().map(|(name, points)| Series { name: name.clone(), points: points.clone(), is_line: true });
+    let series =
+        curves.iter().map(|(name, points)| Series { name: name.clone(), points: points.clone(), is_line: true, ..Series::default() });
     let panels = [Panel {
         title: "Error on points that were not trained on".into(),
         x: "epochs".into(),
@@ -106,13 +107,17 @@ pub fn write_png(chart: &Chart) -> Result<Vec<u8>, DrawError> {
 }
 
 /// Points of one entry of the legend.
+#[derive(Default)]
 struct Series {
     name: String,
     points: Vec<(f64, f64)>,
+    /// Vertical lines from points to a larger value: the two ends.
+    whiskers: Vec<[(f64, f64); 2]>,
     is_line: bool,
 }
 
 /// One panel. The horizontal axis is logarithmic.
+#[derive(Default)]
 struct Panel {
     title: String,
     x: String,
@@ -139,7 +144,7 @@ fn panels(chart: &Chart) -> Vec<Panel> {
             panels.push(ftle_panel(panel, &unit, title, "seconds", |point| point.seconds(samples)));
         }
     }
-    panels.extend(chart.pictures.as_ref().filter(|panel| curves(panel).next().is_some()).map(picture_panel));
+    panels.extend(chart.pictures.iter().flat_map(picture_panels));
     panels.extend(chart.pictures.as_ref().and_then(sliding_panel));
     if let Some(panel) = &chart.scaling {
         let tau = if chart.time_unit.is_empty() { "tau".to_owned() } else { format!("tau, {}", chart.time_unit) };
@@ -157,18 +162,20 @@ fn panels(chart: &Chart) -> Vec<Panel> {
 fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl Fn(&FtlePoint) -> f64) -> Panel {
     let at: Vec<[f64; 2]> = panel.methods.iter().map(|point| [cost(point), point.rms]).collect();
     let mut series: Vec<Series> = Vec::new();
-    for (point, [x, y]) in panel.methods.iter().zip(&at) {
-        match series.iter_mut().find(|series| series.name == point.method) {
-            Some(series) => series.points.push((*x, *y)),
-            None => series.push(Series { name: point.method.clone(), points: vec![(*x, *y)], is_line: false }),
-        }
+    for (point, &[x, y]) in panel.methods.iter().zip(&at) {
+        let number = series.iter().position(|series| series.name == point.method).unwrap_or_else(|| {
+            series.push(Series { name: point.method.clone(), ..Series::default() });
+            series.len() - 1
+        });
+        series[number].points.push((x, y));
+        series[number].whiskers.push([(x, y), (x, point.p99)]);
     }
     let (front, pick) = panel.front(cost);
     let label = |i: usize| (at[i][0], at[i][1], format!("{}, {}", panel.methods[i].setting, size(panel.methods[i].bytes)));
     Panel {
         title,
         x: x.into(),
-        y: format!("root mean square error of the FTLE{unit}"),
+        y: format!("error of the FTLE, root mean square to 99th percentile{unit}"),
         is_y_log: true,
         series,
         front: front.into_iter().map(label).collect(),
@@ -183,30 +190,43 @@ fn curves(panel: &PicturePanel) -> impl Iterator<Item = (String, &PictureCurve)>
     panel.curves.iter().map(|curve| (curve.name(), curve)).chain(map)
 }
 
-fn picture_panel(panel: &PicturePanel) -> Panel {
-    let series = curves(panel).map(|(name, curve)| Series {
-        name,
-        points: curve.frames.iter().map(|frame| (frame.seconds, frame.psnr)).collect(),
-        is_line: true,
-    });
+/// PSNR, relMSE and SSIM of a still window; without those that no frame has.
+fn picture_panels(panel: &PicturePanel) -> impl Iterator<Item = Panel> {
     let [width, height] = panel.size;
-    Panel {
-        title: format!("Pictures of {width} x {height}: time to error, still window"),
-        x: "seconds since the slide, preparation and training included".into(),
-        y: "PSNR over lit pixels, dB".into(),
-        is_y_log: false,
-        series: series.collect(),
-        front: Vec::new(),
-        pick: panel.winner().map(|frame| (frame.seconds, frame.psnr)),
-        levels: [35.0, 40.0].map(|level| (level, format!("{level} dB"))).to_vec(),
-    }
+    let of = |what: &str, y: &str, is_y_log: bool, levels: &[f64], value: fn(&PicturePoint) -> Option<f64>| {
+        // Without the noise of the truth an error may be negative.
+        let is_drawn = |value: &f64| !is_y_log || *value > 0.0;
+        let at = |frame: &PicturePoint| value(frame).filter(is_drawn).map(|value| (frame.seconds, value));
+        let series = curves(panel).map(|(name, curve)| {
+            let points = curve.frames.iter().filter_map(at).collect();
+            Series { name, points, is_line: true, ..Series::default() }
+        });
+        let series: Vec<Series> = series.collect();
+        series.iter().any(|series| !series.points.is_empty()).then(|| Panel {
+            title: format!("Pictures of {width} x {height}: {what}, still window"),
+            x: "seconds since the slide, preparation and training included".into(),
+            y: y.into(),
+            is_y_log,
+            series,
+            front: Vec::new(),
+            pick: panel.winner().and_then(at),
+            levels: levels.iter().map(|&level| (level, format!("{level} dB"))).collect(),
+        })
+    };
+    [
+        of("time to error", "PSNR over lit pixels, dB", false, &[35.0, 40.0], |frame| Some(frame.psnr)),
+        of("time to relMSE", "relMSE over lit pixels", true, &[], |frame| Some(frame.relmse)),
+        of("SSIM", "SSIM of frames that reach 30, 35, 40, 45 dB, and of the last", false, &[], |frame| frame.ssim),
+    ]
+    .into_iter()
+    .flatten()
 }
 
 /// Pictures of a window that slides at every frame; `None` if none was measured.
 fn sliding_panel(panel: &PicturePanel) -> Option<Panel> {
     let at = |curve: &PictureCurve| curve.sliding.and_then(|sliding| Some((1.0 / sliding.frames_per_second, sliding.psnr?)));
     // All curves, so that a method has the colour that it has beside.
-    let series = curves(panel).map(|(name, curve)| Series { name, points: at(curve).into_iter().collect(), is_line: false });
+    let series = curves(panel).map(|(name, curve)| Series { name, points: at(curve).into_iter().collect(), ..Series::default() });
     let series: Vec<Series> = series.collect();
     series.iter().any(|series| !series.points.is_empty()).then(|| Panel {
         title: "Pictures: error against time of a frame, window that slides at every frame".into(),
@@ -231,6 +251,7 @@ fn scaling_panel(panel: &ScalingPanel, axis: Axis, against: &str, label: &str) -
         name: name.into(),
         points: along.iter().map(|point| (point.value, value(point))).collect(),
         is_line: true,
+        ..Series::default()
     };
     Some(Panel {
         title: format!("Cost of a sample against {against}, steps by error"),
@@ -283,7 +304,8 @@ fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, title: &str, panels: &[
 
 /// Range of all finite values, levels included.
 fn span(panel: &Panel, of: impl Fn((f64, f64)) -> f64) -> Range<f64> {
-    let points = panel.series.iter().flat_map(|series| &series.points).map(|point| of(*point));
+    let points =
+        panel.series.iter().flat_map(|series| series.points.iter().chain(series.whiskers.iter().flatten())).map(|point| of(*point));
     let levels = panel.levels.iter().map(|(level, _)| of((f64::NAN, *level)));
     let finite = points.chain(levels).filter(|value| value.is_finite());
     let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)));
@@ -386,10 +408,12 @@ where
     }
     for (number, series) in panel.series.iter().enumerate() {
         let colour = COLOURS[number % COLOURS.len()];
-        let finite: Vec<(f64, f64)> = series.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+        let finite: Vec<(f64, f64)> = series.points.iter().copied().filter(is_drawn).collect();
         if series.is_line {
             plot.draw_series(LineSeries::new(finite.iter().copied(), colour.stroke_width(2))).map_err(plot_error)?;
         }
+        let whiskers = series.whiskers.iter().filter(|ends| ends.iter().all(is_drawn));
+        plot.draw_series(whiskers.map(|ends| PathElement::new(*ends, colour.stroke_width(1)))).map_err(plot_error)?;
         if series.is_line && finite.len() > MARKED {
             continue;
         }
@@ -459,7 +483,14 @@ fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -
 
 #[cfg(test)]
 mod tests {
-    use super::{beside, log, tick};
+    use super::{Panel, Series, beside, log, span, tick};
+
+    #[test]
+    fn a_panel_has_room_for_its_percentiles() {
+        let series = Series { points: vec![(1.0, 2.0)], whiskers: vec![[(1.0, 2.0), (1.0, 9.0)]], ..Series::default() };
+        let panel = Panel { series: vec![series], ..Panel::default() };
+        assert_eq!(span(&panel, |(_, y)| y), 2.0..9.0);
+    }
 
     #[test]
     fn a_logarithmic_axis_has_two_labels_at_least() {

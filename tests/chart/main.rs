@@ -115,7 +115,7 @@ fn pictures_converge_and_the_chart_is_drawn() {
     let coloured = picture.pixels().filter(|pixel| pixel.0.iter().max() != pixel.0.iter().min()).count();
     assert!(picture.width() == 1800 && coloured > 500, "curves have colours: {coloured} pixels");
     let svg = std::fs::read_to_string(out.join("chart.svg")).unwrap();
-    for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "Double gyre"] {
+    for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "relMSE over lit pixels", "SSIM of frames", "Double gyre"] {
         assert!(svg.contains(words), "{words}");
     }
     // The frames that are named for a target tell all measures of error.
