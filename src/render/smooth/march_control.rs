@@ -265,8 +265,8 @@ impl MarchControl {
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
-    /// `has_budget`: the time for rays is limited.
-    pub fn decide(&mut self, others: f64, may_go_on: bool, has_budget: bool) -> Marching {
+    /// `rays_are_limited`: a budget may cut the number of rays that are marched anew.
+    pub fn decide(&mut self, others: f64, may_go_on: bool, rays_are_limited: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
         let (filter, quadrature) = (self.filter.value(0), self.quadrature(0));
         let wanted = filter > SPARE * allowed;
@@ -276,9 +276,9 @@ impl MarchControl {
         }
         let more = filter > allowed && self.rays < MAX_RAYS;
         let finer = quadrature > allowed && self.step > MIN_STEP;
-        // The larger error first, since time may end before both are small. Finer steps discard all rays, so they come first if a budget may not have the
-        // time for as many again.
-        if finer && (!more || has_budget || quadrature >= filter) {
+        // The larger error first, since time may end before both are small. Finer steps discard all rays, so they come first if there may be no time for as
+        // many again.
+        if finer && (!more || rays_are_limited || quadrature >= filter) {
             let next_rays = self.rays.max(PAIR);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
@@ -361,7 +361,7 @@ mod tests {
 
     #[test]
     fn the_larger_error_is_lowered_first() {
-        for (net, fine, rays, step, has_budget, expected) in [
+        for (net, fine, rays, step, rays_are_limited, expected) in [
             (0.5, 0.9, PAIR, FIRST_STEP, false, Marching::More),
             (0.9, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
             (0.5, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
@@ -375,7 +375,7 @@ mod tests {
             let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [fine; 3], nets: [[net; 3]; 2], ..AuditedPixel::default() };
             let mut control = MarchControl { rays, step, ..MarchControl::default() };
             control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
-            assert_eq!(control.decide(1e-6, true, has_budget), expected, "{net}, {fine}, {rays}, {step}");
+            assert_eq!(control.decide(1e-6, true, rays_are_limited), expected, "{net}, {fine}, {rays}, {step}");
         }
     }
 
