@@ -258,7 +258,7 @@ adapter-packages:
 test-adapters: packages python-packages adapter-packages adapters
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release --workspace --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release --workspace --test follow --test messages --test mutation --test properties --test ring --test publish -- --ignored --skip gigabytes; else \
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release --workspace --test messages --test ring --test publish -- --ignored; else \
 	  echo "NOT RUN: the tests of full file systems and of files of another user, since they need root"; fi
 	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release --workspace --test follow -- --ignored gigabytes; else \
 	  echo "NOT RUN: the relay test with steps of 2 GB, since it needs 16 GB of memory"; fi
