@@ -2,7 +2,7 @@
 
 use super::Chart;
 use super::ftle::{CHARGED, FtlePanel, FtlePoint};
-use super::picture::{PictureCurve, PicturePanel, PicturePoint};
+use super::picture::{PictureCurve, PicturePanel, PicturePoint, TARGETS};
 use super::scaling::{Axis, ScalingPanel};
 use super::verdict::size;
 use crate::source::duration;
@@ -111,7 +111,7 @@ pub fn write_png(chart: &Chart) -> Result<Vec<u8>, DrawError> {
 struct Series {
     name: String,
     points: Vec<(f64, f64)>,
-    /// Vertical lines from points to a larger value: the two ends.
+    /// Vertical lines from points to another value: the two ends.
     whiskers: Vec<[(f64, f64); 2]>,
     is_line: bool,
 }
@@ -193,9 +193,10 @@ fn curves(panel: &PicturePanel) -> impl Iterator<Item = (String, &PictureCurve)>
 /// PSNR, relMSE and SSIM of a still window; without those that no frame has.
 fn picture_panels(panel: &PicturePanel) -> impl Iterator<Item = Panel> {
     let [width, height] = panel.size;
+    let targets = TARGETS.map(|target| target.to_string());
     let of = |what: &str, y: &str, is_y_log: bool, levels: &[f64], value: fn(&PicturePoint) -> Option<f64>| {
-        // Without the noise of the truth an error may be negative.
-        let is_drawn = |value: &f64| !is_y_log || *value > 0.0;
+        // An error of 0, which the noise of the truth hides, has no place on a logarithmic axis.
+        let is_drawn = |value: &f64| value.is_finite() && (!is_y_log || *value > 0.0);
         let at = |frame: &PicturePoint| value(frame).filter(is_drawn).map(|value| (frame.seconds, value));
         let series = curves(panel).map(|(name, curve)| {
             let points = curve.frames.iter().filter_map(at).collect();
@@ -203,7 +204,7 @@ fn picture_panels(panel: &PicturePanel) -> impl Iterator<Item = Panel> {
         });
         let series: Vec<Series> = series.collect();
         series.iter().any(|series| !series.points.is_empty()).then(|| Panel {
-            title: format!("Pictures of {width} x {height}: {what}, still window"),
+            title: format!("Pictures of {width} x {height}: {what} over time, still window"),
             x: "seconds since the slide, preparation and training included".into(),
             y: y.into(),
             is_y_log,
@@ -214,9 +215,9 @@ fn picture_panels(panel: &PicturePanel) -> impl Iterator<Item = Panel> {
         })
     };
     [
-        of("time to error", "PSNR over lit pixels, dB", false, &[35.0, 40.0], |frame| Some(frame.psnr)),
-        of("time to relMSE", "relMSE over lit pixels", true, &[], |frame| Some(frame.relmse)),
-        of("SSIM", "SSIM of frames that reach 30, 35, 40, 45 dB, and of the last", false, &[], |frame| frame.ssim),
+        of("PSNR", "PSNR over lit pixels, dB", false, &[35.0, 40.0], |frame| Some(frame.psnr)),
+        of("relMSE", "relMSE over lit pixels", true, &[], |frame| Some(frame.relmse)),
+        of("SSIM", &format!("SSIM of frames that reach {} dB, and of the last", targets.join(", ")), false, &[], |frame| frame.ssim),
     ]
     .into_iter()
     .flatten()

@@ -27,7 +27,7 @@ pub struct Options {
     /// Seconds for all measurements. What did not fit is named.
     #[arg(long, default_value_t = 300.0, value_parser = seconds, value_name = "S")]
     seconds: f64,
-    /// Panels: ftle (error and cost of FTLE samples), pictures (time to error), scaling (cost against tau, nodes, threads).
+    /// Panels: ftle (error and cost of FTLE samples), pictures (PSNR, relMSE and SSIM over time), scaling (cost against tau, nodes, threads).
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Panel::Ftle, Panel::Pictures, Panel::Scaling], value_name = "PANELS")]
     only: Vec<Panel>,
     /// Folder for chart.png, chart.svg, chart.csv and chart.json. Files of these names are replaced. Beside a scene file, SCENE.chart.svg is written for
