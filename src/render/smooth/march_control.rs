@@ -4,7 +4,7 @@ use super::statement::{LIT, MarchError};
 use super::tone::ToneMap;
 use crate::rng::FrameRandom;
 
-/// Two rays on opposite sides of the pixel's centre, with which pictures begin: where pixels are no coarser than nodes, steps err more.
+/// Two rays on opposite sides of the pixel's centre. Pictures of few samples begin with them: where pixels are no coarser than nodes, steps err more.
 pub const PAIR: u64 = 2;
 /// Rays through a point and its quarter turns around the centre. Beyond the first pair, pictures have whole ones.
 pub(super) const QUARTER_TURNS: u64 = 4;
@@ -169,6 +169,13 @@ impl MarchControl {
         Self { next_rays: self.rays.clamp(PAIR, MAX_RAYS), ..self.restarted() }
     }
 
+    /// The first round of a picture has a pair of rays, or its quarter turns too if it has more than one sample a pixel, which take longer than they do.
+    pub fn begin(&mut self, samples: f64) {
+        if self.rays == 0 && samples > 1.0 {
+            self.next_rays = self.next_rays.max(QUARTER_TURNS);
+        }
+    }
+
     /// Rays up to the next whole quarter turns.
     fn to_whole_turns(&self) -> u64 {
         QUARTER_TURNS - self.rays % QUARTER_TURNS
@@ -265,25 +272,19 @@ impl MarchControl {
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
-    /// `rays_are_limited`: a budget may cut the number of rays that are marched anew.
-    pub fn decide(&mut self, others: f64, may_go_on: bool, rays_are_limited: bool) -> Marching {
+    pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let (filter, quadrature) = (self.filter.value(0), self.quadrature(0));
-        let wanted = filter > SPARE * allowed;
+        let wanted = self.filter.value(0) > SPARE * allowed;
         self.next_rays = if wanted && self.rays < MAX_RAYS { self.to_whole_turns() } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
-        let more = filter > allowed && self.rays < MAX_RAYS;
-        let finer = quadrature > allowed && self.step > MIN_STEP;
-        // The larger error first, since time may end before both are small. Finer steps discard all rays, so they come first if there may be no time for as
-        // many again.
-        if finer && (!more || rays_are_limited || quadrature >= filter) {
+        if self.quadrature(0) > allowed && self.step > MIN_STEP {
             let next_rays = self.rays.max(PAIR);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, audits_before: self.audits, ..Self::default() };
             return Marching::Anew;
         }
-        if more {
+        if self.filter.value(0) > allowed && self.rays < MAX_RAYS {
             self.next_rays = self.rays.min(MAX_RAYS - self.rays);
             return Marching::More;
         }
@@ -347,7 +348,7 @@ mod tests {
                     control.at_most(most);
                     control.rays += control.next_rays;
                     control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
-                    control.decide(1e-6, may_go_on, true);
+                    control.decide(1e-6, may_go_on);
                     control.rays
                 })
                 .collect();
@@ -357,26 +358,6 @@ mod tests {
         let mut control = MarchControl { rays: 8, ..MarchControl::default() }.on_other_nodes();
         control.at_most(3);
         assert_eq!((control.rays, control.next_rays), (0, 2));
-    }
-
-    #[test]
-    fn the_larger_error_is_lowered_first() {
-        for (net, fine, rays, step, rays_are_limited, expected) in [
-            (0.5, 0.9, PAIR, FIRST_STEP, false, Marching::More),
-            (0.9, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
-            (0.5, 0.5, PAIR, FIRST_STEP, false, Marching::Anew),
-            // Where one of them cannot be lowered, the other is.
-            (0.5, 0.9, MAX_RAYS, FIRST_STEP, false, Marching::Anew),
-            (0.9, 0.5, PAIR, MIN_STEP, false, Marching::More),
-            (0.5, 0.5, MAX_RAYS, MIN_STEP, false, Marching::Enough),
-            // Steps, while few rays are lost.
-            (0.5, 0.9, PAIR, FIRST_STEP, true, Marching::Anew),
-        ] {
-            let pixel = AuditedPixel { shown: [1.0; 4], pair: [1.0; 3], fine: [fine; 3], nets: [[net; 3]; 2], ..AuditedPixel::default() };
-            let mut control = MarchControl { rays, step, ..MarchControl::default() };
-            control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
-            assert_eq!(control.decide(1e-6, true, rays_are_limited), expected, "{net}, {fine}, {rays}, {step}");
-        }
     }
 
     /// After steps were halved, the statement rests on as many audits as at first.
@@ -392,7 +373,7 @@ mod tests {
                 control.audit([pixel], ToneMap::new([1.0, 0.5, 1.0]));
                 control.rays += control.next_rays;
                 count += 1;
-                if control.decide(others, true, true) == Marching::Anew {
+                if control.decide(others, true) == Marching::Anew {
                     return (count, true);
                 }
             }

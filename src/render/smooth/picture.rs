@@ -126,6 +126,7 @@ impl Picture {
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
         let tone_map = ToneMap::new(scene.settings.tone_map);
         let mut begins = self.march.rays == 0;
+        self.march.begin(round.samples);
         if let (true, Some(budget)) = (begins, round.budget) {
             self.march_at_most(budget);
         }
@@ -156,12 +157,10 @@ impl Picture {
             if round.stop.load(Ordering::Relaxed) {
                 return self.stopped();
             }
-            match self.march.decide(others, marching < allowed, round.budget.is_some()) {
+            match self.march.decide(others, marching < allowed) {
                 Marching::Enough => break (film, error),
                 Marching::Anew => {
                     begins = true;
-                    // Twice as many steps.
-                    self.ray_seconds = self.ray_seconds.map(|seconds| 2.0 * seconds);
                     self.light = None;
                     self.base.fill(RaySum::default());
                 }

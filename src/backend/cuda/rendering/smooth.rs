@@ -177,6 +177,7 @@ impl GpuSmooth {
         answers: &mut dyn DeviceLogStretch,
     ) -> Result<Option<(Arc<Film>, RenderStats, PictureError)>, DeviceError> {
         self.settle(round, renderer, answers)?;
+        self.control.begin(round.samples);
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
         let sampling = Instant::now();
@@ -212,7 +213,7 @@ impl GpuSmooth {
             if !round.is_sum() {
                 self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             }
-            match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed, false) {
+            match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
                 Marching::Enough => break (error, errors_of_tiles(tiles)),
                 Marching::Anew => {
                     // If the preparation fails, the picture starts anew.
