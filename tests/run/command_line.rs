@@ -1,7 +1,7 @@
 //! The command line: what a user types, and what comes back. Every refusal is one clear message with exit status 1 or 2, without a
 //! half-written file and without a panic.
 
-use crate::kit::program::{config, project, records, run, start, summary, text, until};
+use crate::kit::program::{config, records, run, start, summary, text, until};
 use crate::kit::{program, scene};
 use crate::ridgewatch;
 use std::os::unix::process::CommandExt;
@@ -371,8 +371,7 @@ fn an_archive_shorter_than_tau_says_how_many_snapshots_are_needed() {
 #[test]
 fn every_shipped_scene_is_accepted() {
     let folder = tempfile::tempdir().unwrap();
-    for entry in std::fs::read_dir(project("configs")).unwrap() {
-        let path = entry.unwrap().path();
+    for path in crate::scene_file::shipped() {
         ridgewatch::config::SceneFile::read(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
     }
     let out = folder.path().join("t.exr").display().to_string();
