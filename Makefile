@@ -14,8 +14,9 @@
 #                      a solver find the shared library in PREFIX/lib when it runs
 # make fuzz            runs each fuzz target in tests/fuzz for FUZZ_SECONDS (60); cargo-fuzz goes into target/cargo-fuzz only
 # make deny            checks licences, sources and duplicates of the dependencies against deny.toml; cargo-deny goes into target/cargo-deny only
-# make test-adapters   runs the tests of the adapters that need gfortran, mpicc, Python, root or 16 GB. Missing compilers are installed if apt is available (gfortran, openmpi-bin,
-#                      libopenmpi-dev, python3-venv), else named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv only
+# make test-adapters   runs the tests of the adapters that need gfortran, mpicc, Python, root or 16 GB. Missing compilers are installed if apt is available
+#                      (gfortran, openmpi-bin, libopenmpi-dev, python3-venv), else named as NOT RUN; maturin, numpy, pytest and mypy go into
+#                      out/adapters/venv only
 # make live-figures    measures the figures of docs/live.md that need no GPU and prints their tables, in some 20 minutes; with SHORT=1 in a few
 #                      minutes, which only show that each measurement runs
 # make header          generates the C header from the library's source; a test compares the two

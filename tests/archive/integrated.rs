@@ -92,7 +92,7 @@ impl<'a> Compared<'a> {
         Pairs { ours, theirs: numbers, tau: self.tau }
     }
 
-    /// What ftle.py answers. By default many archives have the interpolation of the exact map, so that the same is asked twice.
+    /// What ftle.py answers. With its defaults many an archive has the interpolation of the exact map, so that the same would be asked twice.
     fn ask(&self, task: String) -> Vec<serde_json::Value> {
         let mut asked = self.asked.borrow_mut();
         let answer = asked.entry(task).or_insert_with_key(|task| {
